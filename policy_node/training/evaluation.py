@@ -230,18 +230,18 @@ class Evaluator:
 
         "Cannot" means that it lies above the 95 % interval of the episodes so far.
         """
-        rule = self._config.collect.success_rule
+        rule = self._config.success_rule
 
         def hopeless(outcomes: EpisodeOutcomes) -> bool:
             count = int(successes(outcomes, rule).sum())
             return wilson_interval(count, len(outcomes))[1] < best_success
 
-        episodes = self._config.run.evaluation_episodes
+        episodes = self._config.evaluation_episodes
         return evaluate(self._simulation, actor, episodes, EVALUATION_SEED, hopeless)
 
     def evaluate_others(self) -> dict[str, float]:
         """Return the success rates of the other policies in all episodes, by column."""
-        episodes, rule = self._config.run.evaluation_episodes, self._config.collect.success_rule
+        episodes, rule = self._config.evaluation_episodes, self._config.success_rule
         found = {}
         for column, policy in self.others.items():
             outcomes = evaluate(self._simulation, policy, episodes, EVALUATION_SEED)
@@ -250,7 +250,7 @@ class Evaluator:
 
     def is_complete(self, outcomes: EpisodeOutcomes) -> bool:
         """Return whether an evaluation ran all its episodes, so that it may select the best."""
-        return len(outcomes) >= self._config.run.evaluation_episodes
+        return len(outcomes) >= self._config.evaluation_episodes
 
 
 def successes(outcomes: EpisodeOutcomes, success_rule: str) -> NDArray[np.bool_]:

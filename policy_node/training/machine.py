@@ -71,10 +71,10 @@ def split_threads(config: TrainConfig) -> tuple[int, int]:
     """
     local_workers = int(os.environ.get('LOCAL_WORLD_SIZE', '1'))
     cores = max(len(os.sched_getaffinity(0)) // local_workers, 1)
-    small = config.learner.batch_size <= 1024
-    tensor_threads = config.machine.torch_threads or (1 if small else max(cores // 2, 1))
-    rest = max(cores - tensor_threads, 1) if config.machine.overlap else cores
-    return config.machine.simulation_threads or rest, tensor_threads
+    small = config.batch_size <= 1024
+    tensor_threads = config.torch_threads or (1 if small else max(cores // 2, 1))
+    rest = max(cores - tensor_threads, 1) if config.overlap else cores
+    return config.simulation_threads or rest, tensor_threads
 
 
 def uses_bfloat16(precision: str, device: torch.device) -> bool:

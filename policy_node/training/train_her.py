@@ -25,7 +25,6 @@ from policy_node.training.configuration.flat import (
     given_fields,
     with_assignments,
 )
-from policy_node.training.configuration.groups import Held, Hierarchical, Ppo
 from policy_node.training.configuration.recipes import RECIPES, recipe_config
 
 if TYPE_CHECKING:
@@ -70,7 +69,7 @@ def config_from_arguments(options: argparse.Namespace) -> TrainConfig:
             raise ValueError(f'--no-her excludes --strategy {overrides["strategy"]}')
         overrides['strategy'] = 'none'
     config = _configured(options, overrides)
-    if options.her and config.goals.strategy == 'none':
+    if options.her and config.strategy == 'none':
         raise ValueError('--her excludes strategy none: give another --strategy')
     return config
 
@@ -129,27 +128,27 @@ def _read_experience(config: TrainConfig, directory: Path | None) -> Episodes | 
     """
     if directory is None:
         return None
-    if isinstance(config.learner, Ppo):
+    if config.algorithm == 'ppo':
         raise ValueError(
             'algorithm ppo excludes --from-episodes: it learns only from its own episodes'
         )
-    if config.find(Held):
+    if config.longest_hold > 1:
         raise ValueError(
             'longest_hold above 1 excludes --from-episodes: logged actions have no length'
         )
-    if config.find(Hierarchical):
+    if config.subgoal_every:
         raise ValueError('subgoal_every excludes --from-episodes: logged episodes have no subgoals')
-    if config.collect.gamble:
+    if config.gamble:
         raise ValueError('gamble excludes --from-episodes: in logged episodes gambles end nothing')
     from policy_node.training.experience.episode_files import read_experience
 
-    task = task_spec(config.task, control_hz=config.collect.control_hz)
-    episodes, skipped = read_experience(directory, task, config.collect.control_hz)
+    task = task_spec(config.task, control_hz=config.control_hz)
+    episodes, skipped = read_experience(directory, task, config.control_hz)
     transitions = len(episodes) * episodes.ticks
-    if transitions > config.replay.replay_transitions:
+    if transitions > config.replay_transitions:
         raise ValueError(
             f'{directory} contains {transitions} transitions, '
-            f'the replay {config.replay.replay_transitions}; '
+            f'the replay {config.replay_transitions}; '
             f'allow more with --set replay_transitions={transitions}'
         )
     left_out = f'; {len(skipped)} left out, first: {skipped[0]}' if skipped else ''

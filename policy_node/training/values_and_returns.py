@@ -10,8 +10,8 @@ import torch
 from numpy.typing import NDArray
 
 from fetch_hand_sim.simulation import Simulation
-from policy_node.training.configuration.config import TrainConfig
-from policy_node.training.configuration.flat import DEFAULTS, changed, config_from_dict, to_flat
+from policy_node.training.configuration.config import DEFAULTS, TrainConfig
+from policy_node.training.configuration.flat import changed, config_from_dict, to_flat
 from policy_node.training.evaluation import FIRST_SEED
 from policy_node.training.experience.hindsight import RewardFunction
 from policy_node.training.learners.actor_critic import ActorCritic
@@ -83,7 +83,7 @@ def _read_config(file: Path) -> tuple[TrainConfig, float]:
     if odd:
         raise ValueError(f'{file.parent} has no values of actions: {", ".join(odd)}')
     config = changed(config, replay_transitions=1, learning_starts=0, device='cpu')
-    return config, state.counters.env_steps / config.run.total_steps
+    return config, state.counters.env_steps / config.total_steps
 
 
 def _play(

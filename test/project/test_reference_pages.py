@@ -23,7 +23,7 @@ def test_every_field_of_training_has_a_row_with_its_meaning() -> None:
 
 def test_the_recipes_on_the_page_equal_those_of_training() -> None:
     recipes = TOOL['train_config_page']().partition('## Recipes')[2]
-    gamma = recipe_config('HandReach', 'best').learner.gamma
+    gamma = recipe_config('HandReach', 'best').gamma
     (row,) = (line for line in recipes.splitlines() if line.startswith('| `gamma` |'))
     assert row.split(' | ')[4] == f'`{gamma}`'
 

@@ -1,50 +1,64 @@
-"""The training configuration: groups of fields, each field where it means something.
+"""The training configuration: one table of fields, and the rules between them.
 
-Field names are unique over all groups. `flat.py` maps them to the flat names of `--set`,
-`train(**fields)` and stored runs; `groups.py` has the learners and what studies add to them.
+Each class is a group of fields. `TrainConfig` has them all; `flat.py` reads what users give.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import dataclasses
+import math
+import typing
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import Annotated, Literal, TypeVar
+from typing import Annotated, Any, Literal
 
 from msgs_spec.disturbances import read_disturbances
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ, GoalKind, TaskSpec, task_spec
 from policy_node.policies.checkpoint import MOST_PAST_ACTIONS
 from policy_node.policies.goal_features import goal_features
-from policy_node.training.configuration.groups import (
-    Advantages,
-    Checked,
-    Chosen,
-    Count,
-    Critics,
-    Ddpg,
-    Dense,
-    Density,
-    Held,
-    Hierarchical,
-    Horizon,
-    Imitation,
-    OffPolicy,
-    OneStep,
-    Ppo,
-    Range,
-    Returns,
-    Share,
-    Sparse,
-    Threshold,
-    Total,
-)
-
-Recipe = Literal['paper', 'best', 'robust', 'finetune']
-Option = TypeVar('Option', bound=Checked)
 
 
 @dataclass(frozen=True, slots=True)
-class Collect(Checked):
+class Range:
+    """Least and largest value of a number."""
+
+    low: float
+    high: float = math.inf
+
+    def __str__(self) -> str:
+        low, high = (f'{n:.6g}' if isinstance(n, float) else str(n) for n in (self.low, self.high))
+        return f'{low} or more' if self.high == math.inf else f'{low} ... {high}'
+
+
+# Floats represent all whole numbers up to here.
+LARGEST = 2**53
+# Largest width of a hidden layer.
+MOST_UNITS = 65_536
+
+Share = Annotated[float, Range(0, 1)]
+Below1 = Annotated[float, Range(0, 1 - 1e-6)]
+Total = Annotated[int, Range(0)]
+Count = Annotated[int, Range(0, 1024)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Start:
+    """What is trained."""
+
+    task: str
+    """Task name, `FetchReach`, ..."""
+    recipe: Literal['paper', 'best', 'robust', 'finetune'] = 'best'
+    """Recipe of the values, for the record."""
+    seed: Annotated[int, Range(0, 2**31 - 1)] = 0
+    """Seed of weights, exploration, relabelling and resets."""
+    algorithm: Literal['ddpg', 'ppo', 'imitation'] = 'ddpg'
+    """`ddpg`, `ppo` (on policy: each cycle once, also with goals in hindsight) or `imitation` of
+    the policy in `init_from`, which sees the true state."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Collect:
     """Where episodes come from."""
 
     num_envs: Annotated[int, Range(1, 100_000)] = 64
@@ -60,10 +74,20 @@ class Collect(Checked):
     episode (FetchReach, FetchPush): the paper's own counterexample to hindsight."""
 
 
-@dataclass(frozen=True, slots=True)
-class Goals(Checked):
-    """Goals that replace those of the episodes in a batch."""
+@dataclass(frozen=True, kw_only=True)
+class Goals:
+    """Rewards, and goals that replace those of the episodes in a batch."""
 
+    reward_type: Literal['sparse', 'dense'] = 'sparse'
+    """`sparse` (-1 until success, then 0) or `dense` (negative distance)."""
+    first_distance: Annotated[float, Range(1, 1000)] = 1.0
+    """Factor on the task's success distance at the start of the run; it falls geometrically to 1
+    over the first two thirds. Coarse goals, which are met often, come first."""
+    first_rotation: Annotated[float, Range(1, 1000)] = 1.0
+    """The same for the task's success rotation."""
+    reward_grades: tuple[float, ...] = ()
+    """Rising multiples of the success thresholds, as `.5,1,2,4`. The reward of training becomes the
+    share of them that the distance meets, times that of the rotation, minus 1."""
     strategy: Literal['final', 'future', 'episode', 'random', 'futureactual', 'none'] = 'future'
     """Source of hindsight goals; `none` is without hindsight."""
     hindsight_k: Annotated[int, Range(1, 1000)] = 4
@@ -73,10 +97,13 @@ class Goals(Checked):
     """Mixture of goal sources instead of `strategy`: `future=.4,actual=.3`. The rest keeps its
     goal. Also `displaced` (near the goal achieved before) and with `ppo` `outcome` (achieved by
     other episodes)."""
+    goal_choice: Literal['uniform', 'bellman', 'uncertain'] = 'uniform'
+    """Choice among 8 future goals: `uniform` (any), `bellman` (largest error of the value) or
+    `uncertain` (largest difference between critics)."""
 
 
-@dataclass(frozen=True, slots=True)
-class Network(Checked):
+@dataclass(frozen=True, kw_only=True)
+class Network:
     """Actor and critic."""
 
     hidden_sizes: tuple[int, ...] = (256, 256, 256)
@@ -93,8 +120,8 @@ class Network(Checked):
     Without it, weights are random."""
 
 
-@dataclass(frozen=True, slots=True)
-class Replay(Checked):
+@dataclass(frozen=True, kw_only=True)
+class Replay:
     """Episodes to learn from."""
 
     replay_transitions: Annotated[int, Range(1)] = 1_000_000
@@ -106,10 +133,153 @@ class Replay(Checked):
     moved_share: Share = 0.0
     """Share of a batch from episodes whose achieved goal moved; 0 draws uniformly. The landing of a
     `gamble` is no motion."""
+    ticks_after_drop: Annotated[int, Range(-1)] = -1
+    """Ticks after an object fell off the palm that are still learnt from; -1 is all."""
+    drop_is_lost: bool = False
+    """With `ticks_after_drop`, every tick after the last of them counts -1. Otherwise the learner
+    never sees that a drop is final."""
 
 
-@dataclass(frozen=True, slots=True)
-class Limits(Checked):
+@dataclass(frozen=True, kw_only=True)
+class Learner:
+    """Updates of the networks."""
+
+    batch_size: Annotated[int, Range(1, 1_000_000)] = 1024
+    """Transitions per update."""
+    updates_per_cycle: Annotated[int, Range(0, 100_000)] = 40
+    """Gradient updates after each cycle."""
+    learning_rate: Share = 1e-3
+    """Adam step size of actor and critic."""
+    final_learning_rate: Share = 1.0
+    """Share of `learning_rate` left at `total_steps`, falling linearly; 1 keeps it constant. The
+    network that imagines subgoals keeps the whole."""
+    actor_average: Below1 = 0.0
+    """Share of an average of actor weights kept each cycle. The average is evaluated and saved. 0
+    evaluates the actor itself."""
+    gamma: Below1 = 0.98
+    """Discount. Targets are clipped to [-1/(1-gamma), 0], as in the paper's code, with dense
+    rewards too, although these lie below -1 far from the goal."""
+    action_l2: Annotated[float, Range(0)] = 1.0
+    """Weight of the mean squared action in the actor loss."""
+    critic_first: Total = 0
+    """Updates of the critics before the actor learns too. 0 is 5,000 where `init_from` gives an
+    actor without its critic or fewer than `critics`, else none."""
+    polyak: Share = 0.95
+    """Share of the old target network kept by a target update."""
+    target_update_interval: Annotated[int, Range(1)] = 40
+    """Updates between target updates."""
+    policy_delay: Annotated[int, Range(1, 1000)] = 1
+    """Updates of the critic for each of the actor (TD3, arXiv 1802.09477); 2 takes three quarters
+    of the time."""
+    target: Literal['polyak', 'none'] = 'polyak'
+    """Networks of the targets: `polyak` (slow copies) or `none` (the learning networks)."""
+    discount: Literal['tick', 'time'] = 'tick'
+    """Unit of `gamma`: a `tick`, or `time`: 40 ms at any rate. The reward of a tick is then
+    multiplied by its share of 40 ms, so that values are equal at every rate."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Exploration:
+    """Noise on collected actions."""
+
+    random_epsilon: Share = 0.3
+    """Probability of a uniformly random action."""
+    noise_std: Annotated[float, Range(0)] = 0.2
+    """Standard deviation of the Gaussian noise on other actions."""
+    final_exploration: Share = 1.0
+    """Share of `random_epsilon` and `noise_std` left at `total_steps`; both fall linearly in
+    the last third of the run. 1 keeps them constant."""
+    noise_seconds: Annotated[float, Range(0, 10)] = 0.0
+    """Seconds for which noise and random actions hold; 0 is one tick."""
+    parameter_noise: bool = False
+    """Noise on weights, which moves actions by `noise_std`, instead of noise on actions."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Critics:
+    """Networks that values come from."""
+
+    critics: Annotated[int, Range(1, 100)] = 1
+    """Critics that start differently; the actor follows their mean."""
+    aggregate: Literal['mean', 'min', 'truncated'] = 'mean'
+    """Target from several critics; `truncated` is the mean without the highest."""
+    norm: Literal['none', 'layer', 'batch'] = 'none'
+    """Normalisation of the critic's hidden layers; `batch` as CrossQ, without target networks.
+    `layer_norm` is for both networks."""
+    quantiles: Annotated[int, Range(1, 1000)] = 1
+    """Quantiles of the return that each critic learns; 1 is its mean. Targets take all of them
+    (`mean`) or leave out the highest 2 in 25 (`truncated`: TQC, arXiv 2005.04269)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Values:
+    """What the critics learn."""
+
+    n_step: Annotated[int, Range(1, 100)] = 1
+    """Most steps of a return before it bootstraps."""
+    correction: Literal['none', 'lambda', 'cut'] = 'none'
+    """Correction of longer returns, whose actions are not the actor's: `lambda` (their mean is the
+    truncated lambda-return) or `cut` (they end before an action far from the actor's)."""
+    trace: Below1 = 0.7
+    """With `lambda`, the probability of going on after each step; with `ppo` its lambda."""
+    longest_hold: Annotated[int, Range(1, 1000)] = 1
+    """Most ticks for which the actor holds an action while it collects; above 1 it learns how
+    long. The evaluated and saved actor decides at every tick."""
+    advantage: bool = False
+    """Critics learn values of states and advantages per 40 ms (DAU) instead of action values."""
+    condition: Literal['none', 'threshold', 'horizon'] = 'none'
+    """An input more for actor and critic: `threshold` (log-uniform, .5 ... `widest_threshold` times
+    that of success, also in the reward) or `horizon` (steps left, whose rewards are the value). The
+    actor acts at the threshold of the task and with a whole episode left."""
+    widest_threshold: Annotated[float, Range(1, 10_000)] = 8.0
+    """Largest threshold of `condition=threshold`, in those of success. It should reach from the
+    start of episodes to their goals."""
+    importance: Literal['none', 'density', 'decision'] = 'none'
+    """Weights of transitions: `decision` (with `ppo`) corrects that actions of a replayed episode
+    were for another goal; `density` (with `ddpg`), in the critic's loss, that a goal in hindsight
+    depends on where the transition led."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Subgoals:
+    """Subgoals."""
+
+    subgoal_prior: Annotated[float, Range(0)] = 0.0
+    """Weight in the actor loss of the distance between its actions and those for an imagined
+    subgoal, halfway to the goal by value; 0 imagines none."""
+    imagination_interval: Annotated[int, Range(1, 1000)] = 1
+    """Actor updates for each update of the network that imagines subgoals, which costs almost as
+    much as one of actor and critic."""
+    subgoal_every: Annotated[int, Range(0, 1000)] = 0
+    """Ticks for which a subgoal holds that a second, high level proposes to the actor while it
+    collects; 0 has none. The evaluated and saved actor is given the goal itself."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ppo:
+    """Proximal policy optimisation."""
+
+    first_value: Annotated[float, Range(-1_000_000, 0)] = 0.0
+    """Value that the critic of `ppo` starts with. With -1 / (1 - gamma), the value of failing for
+    ever, no state looks good because it is new."""
+    first_action_gain: Share = 1.0
+    """Factor on the last layer of the actor of `ppo` at the start: near 0 it begins with noise
+    around no action, with any seed."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Imitation:
+    """Imitation of the policy in `init_from` on true states (DAgger)."""
+
+    value_weight: Annotated[float, Range(0, 1000)] = 0.0
+    """Weight of the value that an action loses against the action of the imitated policy, by its
+    critic. It is added to the mean squared difference of the actions."""
+    disturbance_scales: tuple[float, ...] = (1.0,)
+    """Factors on `disturbances`, one for each cycle of collecting in turn."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Limits:
     """Length of the run, evaluations and checkpoints."""
 
     total_steps: Annotated[int, Range(1)] = 5_000_000
@@ -126,8 +296,8 @@ class Limits(Checked):
     """Seconds between checkpoints."""
 
 
-@dataclass(frozen=True, slots=True)
-class Machine(Checked):
+@dataclass(frozen=True, kw_only=True)
+class Machine:
     """Threads, precision and device."""
 
     overlap: bool = True
@@ -142,8 +312,23 @@ class Machine(Checked):
     """Device of the networks."""
 
 
-@dataclass(frozen=True, slots=True)
-class TrainConfig(Checked):
+@dataclass(frozen=True, kw_only=True)
+class TrainConfig(
+    Machine,
+    Limits,
+    Imitation,
+    Ppo,
+    Subgoals,
+    Values,
+    Critics,
+    Exploration,
+    Learner,
+    Replay,
+    Network,
+    Goals,
+    Collect,
+    Start,
+):
     """Everything that decides what a run learns; the same on every worker.
 
     `num_envs`, `batch_size` and `replay_transitions` are totals: with N workers each takes its
@@ -153,73 +338,132 @@ class TrainConfig(Checked):
         ValueError: If a value is not allowed, or fields exclude each other.
     """
 
-    task: str
-    """Task name, `FetchReach`, ..."""
-    recipe: Recipe = 'best'
-    """Recipe of the values, for the record."""
-    seed: Annotated[int, Range(0, 2**31 - 1)] = 0
-    """Seed of weights, exploration, relabelling and resets."""
-    collect: Collect = Collect()
-    reward: Sparse | Dense = field(default_factory=Sparse)
-    goals: Goals = Goals()
-    network: Network = Network()
-    replay: Replay = Replay()
-    learner: Ddpg | Hierarchical | Ppo | Imitation = field(default_factory=Ddpg)
-    run: Limits = Limits()
-    machine: Machine = Machine()
-
     def __post_init__(self) -> None:
-        """Checks the fields, then the rules between groups."""
-        Checked.__post_init__(self)
-        spec = task_spec(self.task, control_hz=self.collect.control_hz)
-        goal_features(self.network.goal_features, spec)
-        read_disturbances(self.collect.disturbances)
-        sizes = self.network.hidden_sizes
-        if not 1 <= len(sizes) <= 64 or not all(1 <= size <= MOST_UNITS for size in sizes):
-            raise ValueError(
-                f'hidden_sizes {str(sizes)[:80]}; allowed: 1 to 64 widths of 1 ... {MOST_UNITS}'
-            )
-        _require_goals(self)
-        _require_reward(self, spec)
-        for holds, reason in _contradictions(self, spec):
-            if holds:
+        """Checks each field, then the rules between fields."""
+        for name, kind in TYPES.items():
+            require_within(name, getattr(self, name), kind)
+        for is_broken, reason in _rules(self, task_spec(self.task, control_hz=self.control_hz)):
+            if is_broken:
                 raise ValueError(reason)
-
-    def find(self, kind: type[Option]) -> Option | None:
-        """Return the learner or its option of this kind, or None where the run has none."""
-        learner = self.learner
-        options: list[object] = [self.reward, learner]
-        if isinstance(learner, OffPolicy):
-            options.append(learner.critic)
-        if isinstance(learner, Ddpg):
-            options += [learner.values, learner.imagined, learner.drop]
-        return next((option for option in options if isinstance(option, kind)), None)
 
     @property
     def tick_share(self) -> float:
         """Duration of a tick in units of what `gamma` discounts."""
-        per_time = isinstance(self.learner, OffPolicy) and self.learner.discount == 'time'
-        return DEFAULT_CONTROL_HZ / self.collect.control_hz if per_time else 1.0
+        return DEFAULT_CONTROL_HZ / self.control_hz if self.discount == 'time' else 1.0
 
     @property
     def tick_gamma(self) -> float:
         """Discount of a tick."""
-        return float(self.learner.gamma**self.tick_share)
+        return float(self.gamma**self.tick_share)
 
     @property
     def lowest_value(self) -> float:
         """Value of a state after which every tick is rewarded with -1."""
         return -self.tick_share / (1.0 - self.tick_gamma)
 
+    @property
+    def noise_ticks(self) -> int:
+        """Number of ticks for which noise on actions holds."""
+        return max(round(self.noise_seconds * self.control_hz), 1)
 
-# Largest width of a hidden layer.
-MOST_UNITS = 65_536
-# Noise of this standard deviation leaves next to nothing of actions in [-1, 1].
-_NOISE_ALONE = 10.0
-# Adam moves a weight by at most about the learning rate; float32 loses smaller sums.
-_NO_CHANGE = 1e-7
-# A value that keeps a larger share of its first value has not moved.
-_KEPT = 0.99
+    @property
+    def narrows(self) -> bool:
+        """True if goals are easier to meet at the start of a run than at its end."""
+        return self.first_distance != 1.0 or self.first_rotation != 1.0
+
+
+# Annotated types of the fields, and their defaults.
+TYPES: dict[str, Any] = {
+    each.name: hint
+    for hints in [typing.get_type_hints(TrainConfig, include_extras=True)]
+    for each in dataclasses.fields(TrainConfig)
+    for hint in [hints[each.name]]
+}
+DEFAULTS: dict[str, Any] = {
+    each.name: {} if each.name == 'goals' else each.default
+    for each in dataclasses.fields(TrainConfig)
+    if each.name != 'task'
+}
+
+
+def range_of(kind: Any) -> Range | None:
+    """Return the range of an annotated number, or None."""
+    return kind.__metadata__[0] if typing.get_origin(kind) is Annotated else None
+
+
+def choices_of(kind: Any) -> tuple[str, ...]:
+    """Return the values of a literal type; of any other none."""
+    return typing.get_args(kind) if typing.get_origin(kind) is Literal else ()
+
+
+def plain_type(kind: Any) -> Any:
+    """Return a type without its range; a literal is a `str`."""
+    if typing.get_origin(kind) is Annotated:
+        return typing.get_args(kind)[0]
+    return str if choices_of(kind) else kind
+
+
+def require_within(name: str, value: Any, kind: Any) -> None:
+    """Reject a value that the type of its field does not allow.
+
+    Raises:
+        ValueError: One line names the field, the value and the allowed ones.
+    """
+    choices, limits = choices_of(kind), range_of(kind)
+    if choices and value not in choices:
+        raise ValueError(f'{name} {value!r:.80}; allowed: {", ".join(choices)}')
+    if plain_type(kind) is int and abs(value) > LARGEST:
+        raise ValueError(f'{name} is too large; allowed: up to {LARGEST}')
+    if plain_type(kind) is float and not math.isfinite(value):
+        raise ValueError(f'{name} {value} is no finite number')
+    if limits and not limits.low <= value <= limits.high:
+        raise ValueError(f'{name} {value}; allowed: {limits}')
+
+
+# Fields that have an effect only with others: their names, what they need, and the test of it.
+NEEDS: tuple[tuple[str, str, Callable[[Any], bool]], ...] = (
+    (
+        'subgoal_every polyak target_update_interval policy_delay target discount critics '
+        'aggregate norm quantiles random_epsilon final_exploration noise_seconds parameter_noise',
+        'algorithm ddpg',
+        lambda c: c.algorithm == 'ddpg',
+    ),
+    ('noise_std', 'algorithm ddpg or ppo', lambda c: c.algorithm != 'imitation'),
+    (
+        'n_step longest_hold advantage condition goal_choice subgoal_prior ticks_after_drop',
+        'algorithm ddpg and no subgoal_every',
+        lambda c: c.algorithm == 'ddpg' and not c.subgoal_every,
+    ),
+    (
+        'importance',
+        'algorithm ppo (decision) or algorithm ddpg and no subgoal_every (density)',
+        lambda c: (
+            c.algorithm == ('ppo' if c.importance == 'decision' else 'ddpg') and not c.subgoal_every
+        ),
+    ),
+    ('correction', 'n_step other than 1', lambda c: c.n_step > 1),
+    (
+        'trace',
+        'correction lambda or algorithm ppo',
+        lambda c: c.correction == 'lambda' or c.algorithm == 'ppo',
+    ),
+    ('widest_threshold', 'condition threshold', lambda c: c.condition == 'threshold'),
+    ('imagination_interval', 'subgoal_prior other than 0.0', lambda c: c.subgoal_prior > 0.0),
+    ('drop_is_lost', 'ticks_after_drop other than -1', lambda c: c.ticks_after_drop >= 0),
+    (
+        'first_distance first_rotation reward_grades',
+        'reward_type sparse',
+        lambda c: c.reward_type == 'sparse',
+    ),
+    ('first_value first_action_gain', 'algorithm ppo', lambda c: c.algorithm == 'ppo'),
+    (
+        'value_weight disturbance_scales',
+        'algorithm imitation',
+        lambda c: c.algorithm == 'imitation',
+    ),
+)
+# Values without effect that differ from the default: only `ddpg` takes random actions.
+WITHOUT_EFFECT: dict[str, Any] = {'random_epsilon': 0.0}
 
 # Sources of goals. `real` keeps the goal of the episode.
 STRATEGIES = ('future', 'final', 'episode', 'random')
@@ -228,22 +472,165 @@ SOURCES = ('real', *STRATEGIES, 'actual', 'displaced', 'outcome')
 FROM_THE_EPISODE = ('future', 'final', 'episode')
 # Tasks that ignore their gripper action.
 GAMBLE_TASKS = ('FetchReach', 'FetchPush')
+# Fields that change what values are of; at most one of them differs from its default.
+_ALTERNATIVES = ('n_step', 'longest_hold', 'advantage', 'condition', 'importance', 'goal_choice')
+
+
+def _changed(config: TrainConfig, names: typing.Iterable[str]) -> list[str]:
+    """Return the fields among these, as `name value`, that differ from their default."""
+    values = {name: getattr(config, name) for name in names}
+    return [f'{name} {value}' for name, value in values.items() if value != DEFAULTS[name]]
 
 
 def unusual_networks(config: TrainConfig) -> list[str]:
     """Return the fields, as `name value`, whose networks no other kind of run can start from."""
-    learner, found = config.learner, []
-    if isinstance(learner, Ppo):
-        found.append('algorithm ppo')
-    if held := config.find(Held):
-        found.append(f'longest_hold {held.longest_hold}')
-    if config.find(Advantages):
-        found.append('advantage True')
-    if isinstance(learner, Hierarchical):
-        found.append(f'subgoal_every {learner.subgoal_every}')
-    if isinstance(learner, OffPolicy) and learner.critic.quantiles > 1:
-        found.append(f'quantiles {learner.critic.quantiles}')
-    return found
+    learner = () if config.algorithm == 'imitation' else ('algorithm',)
+    return _changed(config, (*learner, 'longest_hold', 'advantage', 'subgoal_every', 'quantiles'))
+
+
+def _rules(config: TrainConfig, spec: TaskSpec) -> Iterator[tuple[bool, str]]:
+    """Yield the rules between fields: whether one is broken, and its message.
+
+    Raises:
+        ValueError: If goal features or disturbances are unknown.
+    """
+    c = config
+    goal_features(c.goal_features, spec)
+    read_disturbances(c.disturbances)
+    ppo, is_sparse = c.algorithm == 'ppo', c.reward_type == 'sparse'
+    is_graded = c.narrows or bool(c.reward_grades)
+    yield (
+        not 1 <= len(c.hidden_sizes) <= 64 or not all(1 <= n <= MOST_UNITS for n in c.hidden_sizes),
+        f'hidden_sizes {str(c.hidden_sizes)[:80]}; allowed: 1 to 64 widths of 1 ... {MOST_UNITS}',
+    )
+    yield (
+        not all(low < high for low, high in pairwise((0.0, *c.reward_grades, 1e3))),
+        f'reward_grades {c.reward_grades}: allowed are rising numbers above 0 and below 1000',
+    )
+    yield (
+        spec.rotation_threshold is None and c.first_rotation != 1.0,
+        f'first_rotation: goals of {spec.name} have no rotation',
+    )
+    yield (
+        not spec.position_counts and c.first_distance != 1.0,
+        f'first_distance: the position of goals of {spec.name} does not count',
+    )
+    yield (
+        c.gamble and c.task not in GAMBLE_TASKS,
+        f'gamble: {c.task} uses its gripper; allowed: {", ".join(GAMBLE_TASKS)}',
+    )
+    yield (
+        c.learning_starts > c.replay_transitions,
+        f'learning_starts needs replay_transitions of {c.learning_starts} or more',
+    )
+    yield ppo and c.overlap, 'algorithm ppo needs overlap=false'
+    yield ppo and c.noise_std < 1e-6, f'noise_std {c.noise_std}; allowed: {Range(1e-6)}'
+    scales = c.disturbance_scales
+    yield (
+        not scales or not all(0.0 <= scale <= 10.0 for scale in scales),
+        f'disturbance_scales {scales}; allowed: one or more factors 0 ... 10',
+    )
+    yield (
+        c.algorithm == 'imitation' and not c.init_from,
+        'algorithm imitation needs init_from, the policy to imitate',
+    )
+    unusual, chosen = unusual_networks(c), _changed(c, _ALTERNATIVES)
+    yield bool(c.init_from and unusual), f'init_from excludes {", ".join(unusual)}'
+    yield len(chosen) > 1, f'{" excludes ".join(chosen)}'
+    yield (
+        c.past_actions > 0 and (c.longest_hold > 1 or c.parameter_noise),
+        'past_actions needs longest_hold=1 and parameter_noise=False',
+    )
+    yield (
+        0.0 < c.noise_seconds * c.control_hz < 1.0 - 1e-6,
+        f'noise_seconds {c.noise_seconds:g} is less than a tick of {1.0 / c.control_hz:g} s',
+    )
+    yield c.norm == 'batch' and c.target != 'none', 'norm batch needs target none'
+    yield (
+        c.quantiles > 1 and (c.aggregate == 'min' or c.norm == 'batch'),
+        'quantiles above 1 exclude aggregate min and norm batch',
+    )
+    yield (
+        c.longest_hold > 1 and (c.noise_seconds > 0.0 or c.parameter_noise or c.gamble),
+        'longest_hold above 1 excludes noise_seconds, parameter_noise and gamble',
+    )
+    yield (
+        c.advantage
+        and (
+            c.discount != 'time'
+            or c.norm == 'batch'
+            or bool(_changed(c, ('critics', 'aggregate', 'quantiles')))
+        ),
+        'advantage needs discount time and one critic of its mean, without norm batch',
+    )
+    yield (
+        c.subgoal_prior > 0.0
+        and bool(_changed(c, ('longest_hold', 'advantage', 'condition', 'importance'))),
+        'subgoal_prior excludes longest_hold, advantage, condition and importance',
+    )
+    yield (
+        c.condition != 'none' and is_graded,
+        'condition excludes reward_grades, first_distance and first_rotation',
+    )
+    yield (
+        c.condition == 'threshold' and not is_sparse,
+        'condition threshold needs reward_type sparse',
+    )
+    yield (
+        c.subgoal_every > spec.episode_ticks,
+        f'subgoal_every {c.subgoal_every} is longer than an episode',
+    )
+    yield (
+        c.subgoal_every > 0 and (not is_sparse or is_graded or c.parameter_noise),
+        'subgoal_every needs reward_type sparse and excludes reward_grades, first_distance, '
+        'first_rotation and parameter_noise',
+    )
+    yield (
+        c.ticks_after_drop >= 0 and spec.goal is not GoalKind.POSE,
+        f'ticks_after_drop: {c.task} has no palm to drop an object from',
+    )
+    yield (
+        c.drop_is_lost
+        and (not is_sparse or c.goal_choice == 'bellman' or c.condition == 'horizon'),
+        'drop_is_lost needs reward_type sparse; it excludes condition horizon and bellman',
+    )
+    yield from _rules_of_goals(c)
+
+
+def _rules_of_goals(config: TrainConfig) -> Iterator[tuple[bool, str]]:
+    """Yield the rules about sources of goals."""
+    c, goals, total = config, config.goals, sum(config.goals.values())
+    unknown = sorted(goals.keys() - set(SOURCES))
+    yield bool(unknown), f'goals {goals}: {unknown[:1]}; allowed: {", ".join(SOURCES)}'
+    yield (
+        min(goals.values(), default=1.0) <= 0.0 or total > 1.0 + 1e-9,
+        f'goals {goals}: allowed are shares above 0 that add up to at most 1',
+    )
+    yield bool(goals) and c.strategy == 'none', f'goals {goals} excludes strategy none'
+    yield 'outcome' in goals and c.algorithm != 'ppo', 'goals outcome needs algorithm ppo'
+    yield (
+        c.goal_choice != 'uniform' and 'future' not in (goals or [c.strategy[:6]]),
+        f'goal_choice {c.goal_choice} needs future goals',
+    )
+    yield (
+        c.goal_choice == 'uncertain' and c.critics == 1,
+        'goal_choice uncertain needs critics above 1',
+    )
+    sources = set(goals or {c.strategy}) - {'real', 'none'}
+    known, keeps_some = sources & set(FROM_THE_EPISODE), not goals or total < 1.0 - 1e-9
+    yield (
+        c.importance == 'density' and (not known or not (keeps_some or sources - known)),
+        f'importance density needs goals of the episode ({", ".join(FROM_THE_EPISODE)}) '
+        'beside others',
+    )
+
+
+# Noise of this standard deviation leaves next to nothing of actions in [-1, 1].
+_NOISE_ALONE = 10.0
+# Adam moves a weight by at most about the learning rate; float32 loses smaller sums.
+_NO_CHANGE = 1e-7
+# A value that keeps a larger share of its first value has not moved.
+_KEPT = 0.99
 
 
 def idle_parts(config: TrainConfig, critic_first: int = 0) -> Iterator[str]:
@@ -255,212 +642,40 @@ def idle_parts(config: TrainConfig, critic_first: int = 0) -> Iterator[str]:
         config: Configuration of the whole run.
         critic_first: Updates before the actor learns, where the run has more than its field.
     """
-    learner, total, cycle = config.learner, config.run.total_steps, _cycle_steps(config)
-    cycles = -(-total // cycle)
-    updates = _updates_of(config, cycles)
-    first = max(learner.critic_first, critic_first)
-    delay = learner.policy_delay if isinstance(learner, OffPolicy) else 1
-    if learner.learning_rate * updates < _NO_CHANGE:
+    c = config
+    spec = task_spec(c.task, control_hz=c.control_hz)
+    cycle = c.num_envs * spec.episode_ticks
+    cycles = -(-c.total_steps // cycle)
+    # The replay holds whole episodes, at least those of one cycle.
+    start = min(c.learning_starts, max(c.replay_transitions, cycle))
+    updates = max(cycles - max(-(-start // cycle) - 1, 0), 0) * c.updates_per_cycle
+    first = max(c.critic_first, critic_first)
+    if c.learning_rate * updates < _NO_CHANGE:
         yield (
             f'nothing will be learnt: {updates} updates with learning_starts '
-            f'{config.replay.learning_starts}, updates_per_cycle {learner.updates_per_cycle}, '
-            f'learning_rate {learner.learning_rate:g}, total_steps {total}'
+            f'{c.learning_starts}, updates_per_cycle {c.updates_per_cycle}, '
+            f'learning_rate {c.learning_rate:g}, total_steps {c.total_steps}'
         )
-    elif -(-first // delay) * delay >= updates:
+    elif -(-first // c.policy_delay) * c.policy_delay >= updates:
         yield (
-            f'the actor will not learn: critic_first {first}, policy_delay {delay} '
+            f'the actor will not learn: critic_first {first}, policy_delay {c.policy_delay} '
             f'of {updates} updates'
         )
-    elif learner.actor_average**cycles > _KEPT:
+    elif c.actor_average**cycles > _KEPT:
         yield (
-            f'the evaluated actor will not move: actor_average {learner.actor_average:g} '
+            f'the evaluated actor will not move: actor_average {c.actor_average:g} '
             f'over {cycles} cycles'
         )
-    if isinstance(learner, OffPolicy) and learner.target == 'polyak' and updates:
-        interval = learner.target_update_interval
-        if learner.polyak ** (updates // interval) > _KEPT:
-            yield (
-                f'the targets will not move: polyak {learner.polyak:g}, target_update_interval '
-                f'{interval} of {updates} updates'
-            )
-    noise = learner.exploration
-    epsilon, spread = (
-        noise.final_exploration * each for each in (noise.random_epsilon, noise.noise_std)
-    )
+    moves = updates // c.target_update_interval
+    has_targets = c.algorithm == 'ddpg' and c.target == 'polyak'
+    if has_targets and updates and c.polyak**moves > _KEPT:
+        yield (
+            f'the targets will not move: polyak {c.polyak:g}, target_update_interval '
+            f'{c.target_update_interval} of {updates} updates'
+        )
+    epsilon, spread = (c.final_exploration * each for each in (c.random_epsilon, c.noise_std))
     if epsilon > _KEPT or spread >= _NOISE_ALONE:
         yield (
-            f'the policy will not act while it collects: random_epsilon {noise.random_epsilon:g}, '
-            f'noise_std {noise.noise_std:g}'
-        )
-
-
-def _cycle_steps(config: TrainConfig) -> int:
-    """Return the environment steps of a cycle."""
-    spec = task_spec(config.task, control_hz=config.collect.control_hz)
-    return config.collect.num_envs * spec.episode_ticks
-
-
-def _updates_of(config: TrainConfig, cycles: int) -> int:
-    """Return the number of updates of a whole run; time limits and resumed runs apart."""
-    cycle = _cycle_steps(config)
-    # The replay holds whole episodes, at least those of one cycle.
-    start = min(config.replay.learning_starts, max(config.replay.replay_transitions, cycle))
-    waiting = max(-(-start // cycle) - 1, 0)
-    return max(cycles - waiting, 0) * config.learner.updates_per_cycle
-
-
-def _require_goals(config: TrainConfig) -> None:
-    """Reject mixtures of goals that are not probabilities of known sources."""
-    goals = config.goals.goals
-    unknown = goals.keys() - set(SOURCES)
-    if unknown:
-        raise ValueError(f'goals {goals}: {unknown.pop()!r}; allowed: {", ".join(SOURCES)}')
-    if goals and not (min(goals.values()) > 0.0 and sum(goals.values()) <= 1.0 + 1e-9):
-        raise ValueError(f'goals {goals}: allowed are shares above 0 that add up to at most 1')
-    if goals and config.goals.strategy == 'none':
-        raise ValueError(f'goals {goals} excludes strategy none')
-
-
-def _require_reward(config: TrainConfig, spec: TaskSpec) -> None:
-    """Reject thresholds that the task does not have, and grades that do not rise."""
-    sparse = config.find(Sparse)
-    if sparse is None:
-        return
-    grades = sparse.reward_grades
-    if not all(low < high for low, high in pairwise((0.0, *grades, 1e3))):
-        raise ValueError(
-            f'reward_grades {grades}: allowed are rising numbers above 0 and below 1000'
-        )
-    if spec.rotation_threshold is None and sparse.first_rotation != 1.0:
-        raise ValueError(f'first_rotation: goals of {spec.name} have no rotation')
-    if not spec.position_counts and sparse.first_distance != 1.0:
-        raise ValueError(f'first_distance: the position of goals of {spec.name} does not count')
-
-
-def _is_graded(reward: Sparse) -> bool:
-    """Return whether the reward has thresholds of its own."""
-    return reward.narrows or reward.reward_grades != ()
-
-
-def _contradictions(config: TrainConfig, spec: TaskSpec) -> Iterator[tuple[bool, str]]:
-    """Yield the rules between groups: whether one is broken, and its message."""
-    learner, ppo = config.learner, isinstance(config.learner, Ppo)
-    names = ', '.join(GAMBLE_TASKS)
-    yield (
-        config.collect.gamble and config.task not in GAMBLE_TASKS,
-        f'gamble: {config.task} uses its gripper; allowed: {names}',
-    )
-    yield (
-        config.replay.learning_starts > config.replay.replay_transitions,
-        f'learning_starts needs replay_transitions of {config.replay.learning_starts} or more',
-    )
-    yield 'outcome' in config.goals.goals and not ppo, 'goals outcome needs algorithm ppo'
-    yield ppo and config.machine.overlap, 'algorithm ppo needs overlap=false'
-    scales = learner.disturbance_scales if isinstance(learner, Imitation) else (1.0,)
-    yield (
-        not scales or not all(0.0 <= scale <= 10.0 for scale in scales),
-        f'disturbance_scales {scales}; allowed: one or more factors 0 ... 10',
-    )
-    yield (
-        isinstance(learner, Imitation) and not config.network.init_from,
-        'algorithm imitation needs init_from, the policy to imitate',
-    )
-    unusual = unusual_networks(config)
-    yield bool(config.network.init_from and unusual), f'init_from excludes {", ".join(unusual)}'
-    if isinstance(learner, OffPolicy):
-        yield from _contradictions_of_values(config, learner)
-        yield (
-            config.network.past_actions > 0
-            and (config.find(Held) is not None or learner.exploration.parameter_noise),
-            'past_actions needs longest_hold=1 and parameter_noise=False',
-        )
-    if isinstance(learner, Ddpg):
-        yield from _contradictions_of_options(config, learner, spec)
-    if isinstance(learner, Hierarchical):
-        yield (
-            learner.subgoal_every > spec.episode_ticks,
-            f'subgoal_every {learner.subgoal_every} is longer than an episode',
-        )
-        sparse = config.find(Sparse)
-        yield (
-            sparse is None or _is_graded(sparse) or learner.exploration.parameter_noise,
-            'subgoal_every needs reward_type sparse and excludes reward_grades, first_distance, '
-            'first_rotation and parameter_noise',
-        )
-
-
-def _contradictions_of_values(
-    config: TrainConfig, learner: OffPolicy
-) -> Iterator[tuple[bool, str]]:
-    critic, seconds = learner.critic, learner.exploration.noise_seconds
-    rate = config.collect.control_hz
-    yield (
-        0.0 < seconds * rate < 1.0 - 1e-6,
-        f'noise_seconds {seconds:g} is less than a tick of {1.0 / rate:g} s',
-    )
-    yield critic.norm == 'batch' and learner.target != 'none', 'norm batch needs target none'
-    yield (
-        critic.quantiles > 1 and (critic.aggregate == 'min' or critic.norm == 'batch'),
-        'quantiles above 1 exclude aggregate min and norm batch',
-    )
-
-
-def _contradictions_of_options(
-    config: TrainConfig, learner: Ddpg, spec: TaskSpec
-) -> Iterator[tuple[bool, str]]:
-    """Yield the rules of what studies add to DDPG."""
-    values, critic, sparse = learner.values, learner.critic, config.find(Sparse)
-    noise = learner.exploration
-    yield (
-        isinstance(values, Held)
-        and (noise.noise_seconds > 0.0 or noise.parameter_noise or config.collect.gamble),
-        'longest_hold above 1 excludes noise_seconds, parameter_noise and gamble',
-    )
-    yield (
-        isinstance(values, Advantages)
-        and (
-            learner.discount != 'time'
-            or critic.norm == 'batch'
-            or critic != Critics(norm=critic.norm)
-        ),
-        'advantage needs discount time and one critic of its mean, without norm batch',
-    )
-    yield (
-        learner.imagined is not None and not isinstance(values, OneStep | Returns | Chosen),
-        'subgoal_prior excludes longest_hold, advantage, condition and importance',
-    )
-    yield (
-        isinstance(values, Threshold | Horizon) and sparse is not None and _is_graded(sparse),
-        'condition excludes reward_grades, first_distance and first_rotation',
-    )
-    yield (
-        isinstance(values, Threshold) and sparse is None,
-        ('condition threshold needs reward_type sparse'),
-    )
-    if isinstance(values, Chosen):
-        chosen_from = config.goals.goals or [config.goals.strategy[:6]]
-        yield 'future' not in chosen_from, f'goal_choice {values.goal_choice} needs future goals'
-        yield (
-            values.goal_choice == 'uncertain' and critic.critics == 1,
-            'goal_choice uncertain needs critics above 1',
-        )
-    if isinstance(values, Density):
-        sources = set(config.goals.goals or {config.goals.strategy}) - {'real', 'none'}
-        known = sources & set(FROM_THE_EPISODE)
-        kept = config.goals.goals == {} or sum(config.goals.goals.values()) < 1.0 - 1e-9
-        yield (
-            not known or not (kept or sources - known),
-            f'importance density needs goals of the episode ({", ".join(FROM_THE_EPISODE)}) '
-            'beside others',
-        )
-    if learner.drop is not None:
-        yield (
-            spec.goal is not GoalKind.POSE,
-            f'ticks_after_drop: {config.task} has no palm to drop an object from',
-        )
-        bellman = isinstance(values, Chosen) and values.goal_choice == 'bellman'
-        yield (
-            learner.drop.drop_is_lost
-            and (sparse is None or bellman or isinstance(values, Horizon)),
-            'drop_is_lost needs reward_type sparse; it excludes condition horizon and bellman',
+            f'the policy will not act while it collects: random_epsilon {c.random_epsilon:g}, '
+            f'noise_std {c.noise_std:g}'
         )

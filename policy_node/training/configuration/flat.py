@@ -1,8 +1,4 @@
-"""The one table between flat field names and the groups of `TrainConfig`, and what users write.
-
-Flat names are those of `--set`, of `train(**fields)`, of options and of stored runs, also of
-versions whose configuration had no groups.
-"""
+"""Fields that users write: in options, `--set`, `train(**fields)`, recipes and stored runs."""
 
 from __future__ import annotations
 
@@ -13,24 +9,23 @@ import inspect
 import itertools
 import types
 import typing
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
+import numpy as np
+
 from msgs_spec.text import did_you_mean
-from policy_node.training.configuration.config import TrainConfig
-from policy_node.training.configuration.groups import (
+from policy_node.training.configuration.config import (
+    DEFAULTS,
     LARGEST,
-    Checked,
-    Hierarchical,
-    Learner,
-    Ppo,
+    NEEDS,
+    TYPES,
+    WITHOUT_EFFECT,
     Range,
+    TrainConfig,
     choices_of,
     plain_type,
     range_of,
-    type_name,
-    typed,
-    types_of,
 )
 
 # Fields of earlier versions that no recipe and no study used, with their defaults.
@@ -48,28 +43,6 @@ REMOVED: dict[str, Any] = {
     'temporal_smoothness': 0.0,
     'future_only_steps': 0,
 }
-# Values of `marks` where no group sets them.
-_UNMARKED = {
-    'algorithm': 'ddpg',
-    'reward_type': 'sparse',
-    'condition': 'none',
-    'importance': 'none',
-}
-_MARK_CHOICES = {
-    'algorithm': ('ddpg', 'ppo', 'imitation'),
-    'reward_type': ('sparse', 'dense'),
-    'condition': ('none', 'threshold', 'horizon'),
-    'importance': ('none', 'density', 'decision'),
-}
-_MARK_MEANINGS = {
-    'algorithm': '`ddpg`, `ppo` (on policy: each cycle once, also with goals in hindsight) or '
-    '`imitation` of the policy in `init_from`, which sees the true state.',
-    'reward_type': '`sparse` (-1 until success, then 0) or `dense` (negative distance).',
-    'condition': 'An input more for actor and critic: `threshold` (log-uniform, .5 ... '
-    '`widest_threshold` times that of success, also in the reward) or `horizon` (steps left, whose '
-    'rewards are the value). The actor acts at the threshold of the task and with a whole episode '
-    'left.',
-}
 # Fields for studies; `--help-research` shows them.
 RESEARCH = (
     'algorithm subgoal_every trace importance first_value first_action_gain gamble first_distance '
@@ -82,217 +55,93 @@ RESEARCH = (
 _OTHER_NAMES = {'total_steps': ('--steps',), 'simulation_threads': ('--threads',)}
 
 
-def _groups_in(kind: Any) -> list[type[Checked]]:
-    """Return the groups that a field may hold; for a plain value none."""
-    parts = typing.get_args(kind) if isinstance(kind, types.UnionType) else (kind,)
-    return [part for part in parts if isinstance(part, type) and issubclass(part, Checked)]
-
-
 @dataclasses.dataclass(frozen=True, slots=True)
 class Field:
-    """One flat field.
+    """The description of a field.
 
     Attributes:
-        default: Its value where no group has it.
-        group: Title of the first group that has it.
+        group: Title of its group.
     """
 
     name: str
-    kind: Any
-    default: Any
     meaning: str
     group: str
 
     @property
+    def kind(self) -> Any:
+        """Its type, without a range."""
+        return plain_type(TYPES[self.name])
+
+    @property
+    def default(self) -> Any:
+        """Its default; None for the task."""
+        return DEFAULTS.get(self.name)
+
+    @property
     def choices(self) -> tuple[str, ...]:
         """Allowed values of a field that has a few."""
-        return _MARK_CHOICES.get(self.name) or choices_of(self.kind)
+        return choices_of(TYPES[self.name])
 
     @property
     def limits(self) -> Range | None:
         """Allowed range of a number."""
-        return range_of(self.kind)
+        return range_of(TYPES[self.name])
 
 
-def _walk(group: type[Checked]) -> Iterator[Field]:
-    """Yield the flat fields of a group and of the groups in it; names may come twice."""
-    title = (group.__doc__ or '').splitlines()[0].rstrip('.')
-    meanings = field_docstrings(group)
-    for name, value in {**_UNMARKED, **group.marks}.items():
-        if name in group.marks and name in _UNMARKED:
-            meaning = _MARK_MEANINGS.get(name, '')
-            yield Field(name, str, _UNMARKED.get(name, value), meaning, title)
-    for each in dataclasses.fields(group):  # type: ignore[arg-type]
-        kind = types_of(group)[each.name]
-        inner = _groups_in(kind)
-        for part in inner:
-            yield from _walk(part)
-        if not inner:
-            default = each.default
-            if each.default_factory is not dataclasses.MISSING:
-                default = each.default_factory()
-            yield Field(each.name, kind, default, meanings.get(each.name, ''), title)
-
-
-def field_docstrings(kind: type) -> dict[str, str]:
-    """Return the text below each field of a class and its bases, on one line."""
+def _describe() -> dict[str, Field]:
+    """Return the fields with the text below each, on one line, in the order of the groups."""
     found = {}
-    for each in reversed(kind.__mro__):
-        if each is object or not dataclasses.is_dataclass(each):
-            continue
-        (definition,) = ast.parse(inspect.getsource(each)).body
+    for group in reversed(TrainConfig.__mro__[1:-1]):
+        (definition,) = ast.parse(inspect.getsource(group)).body
         assert isinstance(definition, ast.ClassDef)
+        title = (group.__doc__ or '').splitlines()[0].rstrip('.')
         for field, below in itertools.pairwise(definition.body):
             match field, below:
                 case ast.AnnAssign(ast.Name(name)), ast.Expr(ast.Constant(str(text))):
-                    found[name] = ' '.join(text.split())
+                    found[name] = Field(name, ' '.join(text.split()), title)
     return found
 
 
-def _all_fields() -> dict[str, Field]:
-    found: dict[str, Field] = {}
-    for each in _walk(TrainConfig):
-        known = found.get(each.name)
-        if known is None:
-            found[each.name] = each
-        elif not known.meaning or each.name == 'importance':
-            kind = str if each.name in _UNMARKED else known.kind
-            found[each.name] = dataclasses.replace(
-                known, kind=kind, meaning=each.meaning or known.meaning
-            )
-    return found
-
-
-FIELDS = _all_fields()
-"""All fields by flat name, in the order of the groups."""
-DEFAULTS = {name: each.default for name, each in FIELDS.items() if name != 'task'}
+FIELDS = _describe()
+"""All fields by name, in the order of the groups."""
 
 
 def to_flat(config: TrainConfig) -> dict[str, Any]:
-    """Return all fields by flat name; those that the configuration does not have by default."""
-    flat = {name: each.default for name, each in FIELDS.items()}
-    _flatten(config, flat)
-    return flat
-
-
-def _flatten(group: Checked, flat: dict[str, Any]) -> None:
-    flat |= group.marks
-    for name in types_of(type(group)):
-        value = getattr(group, name)
-        if isinstance(value, Checked):
-            _flatten(value, flat)
-        elif name in flat:
-            flat[name] = value
+    """Return all fields by name."""
+    return {name: getattr(config, name) for name in FIELDS}
 
 
 def from_flat(fields: Mapping[str, Any], **changes: Any) -> TrainConfig:
-    """Build a configuration from flat fields.
+    """Build a configuration; fields without effect get their default.
 
     Args:
-        fields: A recipe or a stored run. Fields of groups that the run does not have are ignored.
+        fields: A recipe or a stored run.
         **changes: Fields that the user gave. Each must have an effect or its default.
 
     Raises:
         ValueError: If a field is unknown, a value is not allowed, or fields exclude each other.
     """
-    flat = {**DEFAULTS, **typed_fields(fields), **typed_fields(changes)}
-    if 'task' not in flat:
+    values = types.SimpleNamespace(**{**DEFAULTS, **typed_fields(fields), **typed_fields(changes)})
+    if not hasattr(values, 'task'):
         raise ValueError('task is missing')
-    for name, allowed in _MARK_CHOICES.items():
-        if flat[name] not in allowed:
-            raise ValueError(f'{name} {flat[name]!r}; allowed: {", ".join(allowed)}')
-    used: dict[str, Any] = {}
-    config = _build(TrainConfig, flat, used)
-    assert isinstance(config, TrainConfig)
-    for name in changes:
-        effective = used.get(name, DEFAULTS.get(name))
-        if flat[name] not in (effective, DEFAULTS.get(name)):
-            raise ValueError(
-                f'{name} {flat[name]!r} has no effect: it needs {_needed(name, flat[name])}'
-            )
-    return config
+    for names, needed, holds in NEEDS:
+        if holds(values):
+            continue
+        for name in names.split():
+            given, idle = getattr(values, name), WITHOUT_EFFECT.get(name, DEFAULTS[name])
+            if name in changes and given not in (idle, DEFAULTS[name]):
+                raise ValueError(f'{name} {given!r} has no effect: it needs {needed}')
+            setattr(values, name, idle)
+    return TrainConfig(**vars(values))
 
 
 def changed(config: TrainConfig, **changes: Any) -> TrainConfig:
-    """Return a configuration with flat fields replaced.
+    """Return a configuration with fields replaced.
 
     Raises:
         ValueError: As `from_flat`.
     """
     return from_flat(to_flat(config), **changes)
-
-
-def _build(group: type[Checked], flat: Mapping[str, Any], used: dict[str, Any]) -> Checked:
-    used |= group.marks
-    values = {}
-    for name, kind in types_of(group).items():
-        inner = _groups_in(kind)
-        if not inner:
-            values[name] = used[name] = flat[name]
-        elif chosen := _chosen(inner, flat):
-            values[name] = _build(chosen, flat, used)
-    return group(**values)
-
-
-def _chosen(groups: list[type[Checked]], flat: Mapping[str, Any]) -> type[Checked] | None:
-    """Return the group that the flat fields select, or the first or only one by default."""
-    if len(groups) == 1 and not _selector(groups[0]):
-        return groups[0]
-    selected = [group for group in groups if _is_selected(group, flat)]
-    if len(selected) > 1 and issubclass(selected[0], Learner):
-        if Ppo in selected:
-            raise ValueError(f'algorithm ppo excludes subgoal_every {flat["subgoal_every"]}')
-        selected = [Hierarchical]
-    if len(selected) > 1:
-        names = [f'{_selector(each)} {flat[_selector(each)]}' for each in selected]
-        raise ValueError(f'{names[0]} excludes {", ".join(names[1:])}')
-    return selected[0] if selected else next((g for g in groups if not _selector(g)), None)
-
-
-def _is_selected(group: type[Checked], flat: Mapping[str, Any]) -> bool:
-    name = _selector(group)
-    if name in group.marks:
-        return bool(flat[name] == group.marks[name])
-    return bool(name) and bool(flat[name] != DEFAULTS[name])
-
-
-def _selector(group: type[Checked]) -> str:
-    """Return the flat field that selects a group of several, '' for one that needs none."""
-    if group.marks:
-        return next(iter(group.marks))
-    if group.__name__ in _ALTERNATIVES:
-        return _ALTERNATIVES[group.__name__]
-    return ''
-
-
-_ALTERNATIVES = {
-    'Hierarchical': 'subgoal_every',
-    'Returns': 'n_step',
-    'Held': 'longest_hold',
-    'Advantages': 'advantage',
-    'Chosen': 'goal_choice',
-    'Imagined': 'subgoal_prior',
-    'Drop': 'ticks_after_drop',
-}
-
-
-def _needed(name: str, value: Any) -> str:
-    """Return the flat fields that select the groups which have a field with this value."""
-    found = []
-    for group in _all_groups(TrainConfig):
-        selector = _selector(group)
-        if selector and selector != name and name in types_of(group):
-            if value in (choices_of(types_of(group)[name]) or [value]):
-                default = f'other than {DEFAULTS[selector]}'
-                found.append(f'{selector} {group.marks.get(selector, default)}')
-    return ' or '.join(dict.fromkeys(found)) or 'algorithm ddpg and no subgoal_every'
-
-
-def _all_groups(group: type[Checked]) -> Iterator[type[Checked]]:
-    yield group
-    for kind in types_of(group).values():
-        for part in _groups_in(kind):
-            yield from _all_groups(part)
 
 
 def config_from_dict(values: Mapping[str, Any], **changes: Any) -> TrainConfig:
@@ -313,7 +162,10 @@ def removed_fields(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def typed_fields(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return flat fields with values of their types: lists become tuples, texts mixtures of goals.
+    """Return fields with values of their types.
+
+    Scalars of NumPy become those of Python, lists tuples, whole numbers floats, and texts mixtures
+    of goals or grades.
 
     Raises:
         ValueError: If a field is unknown or a value is not of its type.
@@ -324,10 +176,29 @@ def typed_fields(values: Mapping[str, Any]) -> dict[str, Any]:
         raise ValueError(f'unknown configuration fields: {", ".join(unknown)}{near}')
     found = {}
     for name, value in values.items():
-        kind = FIELDS[name].kind
         is_text = isinstance(value, str) and name in ('goals', 'reward_grades')
-        found[name] = parse_value(name, value) if is_text else typed(name, value, kind)
+        kind = FIELDS[name].kind
+        found[name] = parse_value(name, value) if is_text else _typed(name, value, kind)
     return found
+
+
+def _typed(name: str, value: Any, kind: Any) -> Any:
+    origin = typing.get_origin(kind)
+    if origin is tuple and isinstance(value, list | tuple):
+        part = typing.get_args(kind)[0]
+        return tuple(_typed(name, each, part) for each in value)
+    if origin is dict and isinstance(value, dict):
+        return {str(key): _typed(name, each, float) for key, each in value.items()}
+    value = value.item() if isinstance(value, np.generic) else value
+    if kind is float and type(value) is int and abs(value) <= LARGEST:
+        return float(value)
+    if type(value) is not kind:
+        raise ValueError(f'{name} {value!r:.80} is not of type {_type_name(kind)}')
+    return value
+
+
+def _type_name(kind: Any) -> str:
+    return str(kind) if isinstance(kind, types.GenericAlias) else str(kind.__name__)
 
 
 def parse_assignment(text: str) -> tuple[str, Any]:
@@ -351,18 +222,20 @@ def parse_value(name: str, text: str) -> Any:
     Raises:
         ValueError: If it does not fit the field's type.
     """
-    kind = plain_type(FIELDS[name].kind)
+    kind = FIELDS[name].kind
     try:
         return _parse(text, kind)
     except ValueError:
         form = {dict: 'name=share with commas', tuple: 'numbers with commas: N,N,...'}
-        wanted = form.get(typing.get_origin(kind) or kind, f'of type {type_name(kind)}')
+        wanted = form.get(typing.get_origin(kind) or kind, f'of type {_type_name(kind)}')
         raise ValueError(f'{name} {text!r} is not {wanted}') from None
 
 
 def _parse(text: str, kind: Any) -> Any:
     if kind is bool:
-        return {'true': True, 'false': False, '1': True, '0': False}[_known_bool(text)]
+        if text.lower() not in ('true', 'false', '1', '0'):
+            raise ValueError(text)
+        return text.lower() in ('true', '1')
     if typing.get_origin(kind) is tuple:
         part = typing.get_args(kind)[0]
         return tuple(part(each) for each in text.split(',') if each)
@@ -372,12 +245,6 @@ def _parse(text: str, kind: Any) -> Any:
             raise ValueError(text)
         return {source: float(share) for source, share in pairs}
     return whole(text) if kind is int else kind(text)
-
-
-def _known_bool(text: str) -> str:
-    if text.lower() not in ('true', 'false', '1', '0'):
-        raise ValueError(text)
-    return text.lower()
 
 
 def whole(text: str) -> int:
@@ -417,19 +284,17 @@ def add_field_options(parser: argparse.ArgumentParser, without: tuple[str, ...])
     parser.add_argument(
         '--help-research', action=_ResearchHelp, page=research, help='show the fields for studies'
     )
-    groups: dict[tuple[str, bool], Any] = {}
+    groups: dict[str, Any] = {}
     for name, each in FIELDS.items():
         if name in without:
             continue
-        is_research = name in RESEARCH
-        if is_research:
-            _add_option(research, each, shown=True)
-            _add_option(parser, each, shown=False)
+        if name in RESEARCH:
+            _add_option(research, each)
+            _add_option(parser, dataclasses.replace(each, meaning=argparse.SUPPRESS))
             continue
-        group = groups.get((each.group, is_research))
-        if group is None:
-            group = groups[each.group, is_research] = parser.add_argument_group(each.group)
-        _add_option(group, each, shown=True)
+        if each.group not in groups:
+            groups[each.group] = parser.add_argument_group(each.group)
+        _add_option(groups[each.group], each)
 
 
 class _ResearchHelp(argparse.Action):
@@ -444,33 +309,22 @@ class _ResearchHelp(argparse.Action):
         parser.exit()
 
 
-def _add_option(group: Any, each: Field, shown: bool) -> None:
+def _add_option(group: Any, each: Field) -> None:
     names = (*_OTHER_NAMES.get(each.name, ()), f'--{each.name.replace("_", "-")}')
     options: dict[str, Any] = {'dest': each.name, 'help': each.meaning.replace('%', '%%')}
-    if not shown:
-        options['help'] = argparse.SUPPRESS
-    kind = plain_type(each.kind)
-    if kind is bool:
+    if each.kind is bool:
         group.add_argument(*names, action=argparse.BooleanOptionalAction, **options)
         return
-    metavar = {int: 'N', float: 'X', str: 'TEXT'}.get(kind, 'X,X,...')
-    if each.choices:
-        metavar = '{' + ','.join(each.choices) + '}'
-    if typing.get_origin(kind) is dict:
-        metavar = 'NAME=X,...'
-    group.add_argument(*names, type=_reader(each.name), metavar=metavar, **options)
-
-
-def _reader(name: str) -> Any:
-    """Return the function that reads a value of a field."""
+    metavar = {int: 'N', float: 'X', str: 'TEXT', dict[str, float]: 'NAME=X,...'}
+    shown = '{' + ','.join(each.choices) + '}' if each.choices else metavar.get(each.kind)
 
     def read(text: str) -> Any:
         try:
-            return parse_value(name, text)
+            return parse_value(each.name, text)
         except ValueError as error:
             raise argparse.ArgumentTypeError(str(error)) from None
 
-    return read
+    group.add_argument(*names, type=read, metavar=shown or 'X,X,...', **options)
 
 
 def given_fields(options: argparse.Namespace) -> dict[str, Any]:

@@ -9,8 +9,8 @@ from typing import Any
 
 from msgs_spec.disturbances import PRESETS
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ, task_spec
-from policy_node.training.configuration.config import TrainConfig
-from policy_node.training.configuration.flat import DEFAULTS, from_flat
+from policy_node.training.configuration.config import DEFAULTS, TrainConfig
+from policy_node.training.configuration.flat import from_flat
 
 # Recipes of runs that start from nothing.
 FROM_NOTHING = ('paper', 'best')

@@ -80,17 +80,16 @@ class Collector:
         self.simulation = simulation
         self.exploration = 1.0
         self._generator = np.random.default_rng(seeds[0])
-        spec, noise = simulation.spec, config.learner.exploration
-        size = spec.robot.action_size
+        size = simulation.spec.robot.action_size
         self._action_size = size
-        self._past_size = config.network.past_actions * size
+        self._past_size = config.past_actions * size
         self._columns = size + extra_actions + extra_columns
         self._noise = ActionNoise(
             self._generator,
             (simulation.num_envs, size + extra_actions),
-            0.0 if noise.parameter_noise else noise.noise_std,
-            noise.random_epsilon,
-            noise.noise_ticks(config.collect.control_hz),
+            0.0 if config.parameter_noise else config.noise_std,
+            config.random_epsilon,
+            config.noise_ticks,
         )
         self._seeds: list[int] | None = seeds
 

@@ -14,7 +14,6 @@ from msgs_spec.tasks import GoalKind, TaskSpec
 from policy_node.policies.actor import Actor, Normalizer
 from policy_node.policies.network_shape import INPUT_CLIP
 from policy_node.training.configuration.config import TrainConfig
-from policy_node.training.configuration.groups import Drop
 from policy_node.training.experience.hindsight import complete_mixture, goal_mixture
 from policy_node.training.experience.replay import (
     EpisodeReplay,
@@ -105,17 +104,16 @@ class Experience:
         self._sampler = sampler
         self._weigh = weigh
         self.generator = generator
-        self.batch_size = workers.share(config.learner.batch_size)
-        inputs = spec.observation_size + config.network.past_actions * spec.robot.action_size
+        self.batch_size = workers.share(config.batch_size)
+        inputs = spec.observation_size + config.past_actions * spec.robot.action_size
         self.statistics = {
             'observation_statistics': RunningStatistics(inputs),
             'goal_statistics': RunningStatistics(spec.goal.size),
         }
-        drop = config.find(Drop)
-        self._count_ticks = ticks_until_dropped(spec, drop.ticks_after_drop if drop else -1)
-        capacity = max(workers.share(config.replay.replay_transitions) // spec.episode_ticks, 1)
+        self._count_ticks = ticks_until_dropped(spec, config.ticks_after_drop)
+        capacity = max(workers.share(config.replay_transitions) // spec.episode_ticks, 1)
         self.replay = EpisodeReplay(
-            max(capacity, workers.share(config.collect.num_envs)),
+            max(capacity, workers.share(config.num_envs)),
             spec.episode_ticks,
             inputs,
             spec.goal.size,
@@ -165,12 +163,12 @@ class Experience:
 
     def _draw_rows(self) -> NDArray[np.int64]:
         """Draw the episode of each transition of a batch."""
-        return self.replay.draw(self.batch_size, self.config.replay.moved_share, self.generator)
+        return self.replay.draw(self.batch_size, self.config.moved_share, self.generator)
 
     def mixture(self) -> dict[str, float]:
         """Return the probability of each goal source."""
-        goals = self.config.goals
-        return complete_mixture(goals.goals) or goal_mixture(goals.strategy, goals.hindsight_k)
+        config = self.config
+        return complete_mixture(config.goals) or goal_mixture(config.strategy, config.hindsight_k)
 
 
 def ticks_until_dropped(

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from fetch_hand_sim.simulation.rewards import GoalMetric
 from policy_node.training.configuration.config import TrainConfig
-from policy_node.training.configuration.groups import Sparse
 from policy_node.training.experience.hindsight import RewardFunction
 
 Values = NDArray[np.float64]
@@ -51,16 +50,15 @@ def reward_schedule(config: TrainConfig, metric: GoalMetric) -> Callable[[float]
     Raises:
         ValueError: If the configuration replaces the own reward of a third-party task.
     """
-    sparse = config.find(Sparse) or Sparse()
-    if metric.has_own_reward and sparse.reward_grades:
+    if metric.has_own_reward and config.reward_grades:
         raise ValueError(
-            f'reward_grades {sparse.reward_grades} would replace {own_reward(metric)}; allowed: '
+            f'reward_grades {config.reward_grades} would replace {own_reward(metric)}; allowed: '
             'none (--set reward_grades=)'
         )
 
     def reward_at(progress: float) -> RewardFunction:
-        then = narrowed(metric, sparse, progress)
-        return GradedReward(then, sparse.reward_grades) if sparse.reward_grades else then.reward
+        then = narrowed(metric, config, progress)
+        return GradedReward(then, config.reward_grades) if config.reward_grades else then.reward
 
     return reward_at
 
@@ -70,10 +68,10 @@ def own_reward(metric: GoalMetric) -> str:
     return f'the reward of {metric.spec.name} itself ({type(metric).__name__})'
 
 
-def narrowed(metric: GoalMetric, reward: Sparse, progress: float) -> GoalMetric:
+def narrowed(metric: GoalMetric, config: TrainConfig, progress: float) -> GoalMetric:
     """Return the metric with the thresholds of a run's progress, 0 ... 1."""
     left = max(1.0 - 1.5 * progress, 0.0)
-    distance, rotation = reward.first_distance**left, reward.first_rotation**left
+    distance, rotation = config.first_distance**left, config.first_rotation**left
     spec = replace(metric.spec, distance_threshold=metric.spec.distance_threshold * distance)
     if spec.rotation_threshold is not None:
         spec = replace(spec, rotation_threshold=spec.rotation_threshold * rotation)

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from fetch_hand_sim.simulation.rewards import GoalMetric
 from msgs_spec.arrays import Array32
 from policy_node.training.configuration.config import TrainConfig
-from policy_node.training.configuration.groups import Drop, Returns, Sparse
 from policy_node.training.experience.hindsight import (
     SOURCES,
     RewardFunction,
@@ -155,14 +154,13 @@ def sampler_fields(config: TrainConfig, metric: GoalMetric) -> dict[str, Any]:
         ValueError: If the configuration replaces the own reward of a third-party task.
     """
     reward_at = reward_schedule(config, metric)
-    sparse, returns, drop = config.find(Sparse), config.find(Returns), config.find(Drop)
     return {
         'compute_reward': reward_at(1.0),
         'gamma': config.tick_gamma,
-        'most_steps': returns.n_step if returns else 1,
+        'most_steps': config.n_step,
         'reward_scale': config.tick_share,
-        'lost_value': config.lowest_value if drop and drop.drop_is_lost else None,
-        'reward_at': reward_at if sparse and sparse.narrows else None,
+        'lost_value': config.lowest_value if config.drop_is_lost else None,
+        'reward_at': reward_at if config.narrows else None,
     }
 
 

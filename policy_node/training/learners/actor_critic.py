@@ -54,11 +54,11 @@ class ActorCritic:
         self.average_actor = copy.deepcopy(self.actor.network)
         self.actor_optimizer = self._adam(self.actor_parameters)
         self.critic_optimizer = self._adam(self.critic_parameters)
-        self.critic_first = config.learner.critic_first
+        self.critic_first = config.critic_first
         self.updates = 0
 
     def _adam(self, parameters: list[nn.Parameter]) -> torch.optim.Adam:
-        return torch.optim.Adam(parameters, lr=self.config.learner.learning_rate, fused=True)
+        return torch.optim.Adam(parameters, lr=self.config.learning_rate, fused=True)
 
     def update(self, batch: Transitions) -> Losses:
         """Improve the networks on a batch."""
@@ -77,7 +77,7 @@ class ActorCritic:
     @torch.no_grad()
     def average(self) -> None:
         """Move the averaged actor towards the actor, once per cycle."""
-        weight = 1.0 - self.config.learner.actor_average
+        weight = 1.0 - self.config.actor_average
         averaged: list[Tensor] = list(self.average_actor.parameters())
         torch._foreach_lerp_(averaged, [*self.actor_parameters], weight)
 
@@ -113,9 +113,7 @@ class ActorCritic:
     def set_progress(self, progress: float) -> None:
         """Set the learning rate for this progress of the run, 0 ... 1."""
         config, share = self.config, min(max(progress, 0.0), 1.0)
-        rate = config.learner.learning_rate * (
-            1.0 - share * (1.0 - config.learner.final_learning_rate)
-        )
+        rate = config.learning_rate * (1.0 - share * (1.0 - config.final_learning_rate))
         for optimizer in (self.actor_optimizer, self.critic_optimizer):
             optimizer.param_groups[0]['lr'] = rate
 
@@ -131,10 +129,10 @@ def network_shape(config: TrainConfig, extra_actions: int = 0) -> NetworkShape:
         observation_size=spec.observation_size,
         goal_size=spec.goal.size,
         action_size=spec.robot.action_size + extra_actions,
-        hidden_sizes=config.network.hidden_sizes,
-        layer_norm=config.network.layer_norm,
-        goal_features=goal_features(config.network.goal_features, spec),
-        past_actions=config.network.past_actions,
+        hidden_sizes=config.hidden_sizes,
+        layer_norm=config.layer_norm,
+        goal_features=goal_features(config.goal_features, spec),
+        past_actions=config.past_actions,
     )
 
 

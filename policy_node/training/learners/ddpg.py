@@ -13,7 +13,6 @@ from msgs_spec.arrays import Array32
 from policy_node.policies.actor import MLP, Actor
 from policy_node.policies.network_shape import NetworkShape
 from policy_node.training.configuration.config import TrainConfig
-from policy_node.training.configuration.groups import OffPolicy
 from policy_node.training.experience.replay import Transitions
 from policy_node.training.learners.actor_critic import ActorCritic, Losses
 from policy_node.training.machine import Workers, uses_bfloat16
@@ -91,7 +90,7 @@ class TargetNetworks:
     @torch.no_grad()
     def move(self, learner: DDPG) -> None:
         """Move the copies towards the networks by the share 1 - `polyak`."""
-        weight = 1.0 - learner.options.polyak
+        weight = 1.0 - learner.config.polyak
         copies = learner.target_actor, learner.target_critic
         old: list[Tensor] = [each for network in copies for each in network.parameters()]
         new: list[Tensor] = [*learner.actor_parameters, *learner.critic_parameters]
@@ -127,15 +126,14 @@ class DDPG(ActorCritic):
         parts: Parts | None = None,
     ) -> None:
         parts = parts or Parts()
-        assert isinstance(config.learner, OffPolicy)
-        self.config, self.options = config, config.learner
+        self.config = config
         self.critic_loss = parts.critic_loss
         actor, critic = self._make_networks(shape)
         # A batch normalization updates its statistics only in the update of the critic.
         super().__init__(actor, critic.eval(), config, device, workers)
         self._targets = parts.targets(self.actor.network, self.critic)
         self.target_actor, self.target_critic = self._targets.actor, self._targets.critic
-        self._bfloat16 = uses_bfloat16(config.machine.precision, device)
+        self._bfloat16 = uses_bfloat16(config.precision, device)
         # Loss and value of the last update of the actor.
         self._of_actor = (torch.zeros((), device=device),) * 2
 
@@ -146,10 +144,10 @@ class DDPG(ActorCritic):
         """Improve the critic, the actor and, when due, move the target networks."""
         tensors = self.tensors(batch)
         critic_loss = self._update_critic(tensors)
-        if self.updates % self.options.policy_delay == 0:
+        if self.updates % self.config.policy_delay == 0:
             self._of_actor = self._update_actor(tensors)
         self.updates += 1
-        if self.updates % self.options.target_update_interval == 0:
+        if self.updates % self.config.target_update_interval == 0:
             self._targets.move(self)
         return Losses(critic_loss, *self._of_actor)
 
@@ -206,7 +204,7 @@ class DDPG(ActorCritic):
     def _penalty(self, batch: TensorBatch, action: Tensor) -> Tensor:
         """Return the cost of the actor's actions, which is subtracted from their value."""
         del batch
-        cost: Tensor = self.options.action_l2 * action.float().square().mean()
+        cost: Tensor = self.config.action_l2 * action.float().square().mean()
         return cost
 
     @torch.no_grad()

@@ -22,7 +22,6 @@ from msgs_spec.tasks import GoalKind, task_spec
 from policy_node.policies.actor import MLP
 from policy_node.policies.network_shape import NetworkShape
 from policy_node.training.configuration.config import TrainConfig
-from policy_node.training.configuration.groups import Imagined
 from policy_node.training.learners.ddpg import DDPG, Parts, TensorBatch
 from policy_node.training.machine import Workers
 
@@ -50,7 +49,6 @@ class ImaginingDDPG(DDPG):
         parts: Parts | None = None,
     ) -> None:
         super().__init__(shape, config, device, workers, parts)
-        self._imagined = config.find(Imagined) or Imagined()
         self.imagination = MLP(shape.feature_size, shape.goal_size, shape).to(device)
         self._imagination_parameters = list(self.imagination.parameters())
         workers.broadcast(self._imagination_parameters)
@@ -61,8 +59,8 @@ class ImaginingDDPG(DDPG):
         self._is_pose = spec.goal is GoalKind.POSE
 
     def _update_actor(self, batch: TensorBatch) -> tuple[Tensor, Tensor]:
-        actor_updates = self.updates // self.options.policy_delay
-        if actor_updates % self._imagined.imagination_interval == 0:
+        actor_updates = self.updates // self.config.policy_delay
+        if actor_updates % self.config.imagination_interval == 0:
             self._update_imagination(batch)
         return super()._update_actor(batch)
 
@@ -101,7 +99,7 @@ class ImaginingDDPG(DDPG):
             features = self.actor.features(batch.observation, self.imagine(batch.features))
             prior = torch.tanh(self.target_actor(features))
         distance: Tensor = (action - prior).float().square().mean()
-        return super()._penalty(batch, action) + self._imagined.subgoal_prior * distance
+        return super()._penalty(batch, action) + self.config.subgoal_prior * distance
 
     def imagine(self, features: Tensor) -> Tensor:
         """Return subgoals (batch, goal_size) in units of the task from features (batch, size)."""

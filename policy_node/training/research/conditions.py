@@ -20,7 +20,6 @@ from fetch_hand_sim.simulation.rewards import GoalMetric
 from msgs_spec.arrays import Array32
 from policy_node.policies.actor import MLP, Actor
 from policy_node.policies.network_shape import NetworkShape
-from policy_node.training.configuration import groups
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.experience.replay import Starts, Transitions
 from policy_node.training.experience.rewards import own_reward
@@ -116,9 +115,9 @@ def acting_input(config: TrainConfig) -> float | None:
 
     The threshold is that of training, the horizon a whole episode.
     """
-    if config.find(groups.Threshold):
+    if config.condition == 'threshold':
         return 0.0
-    return 1.0 if config.find(groups.Horizon) else None
+    return 1.0 if config.condition == 'horizon' else None
 
 
 def make_condition(config: TrainConfig, metric: GoalMetric) -> Condition:
@@ -127,14 +126,13 @@ def make_condition(config: TrainConfig, metric: GoalMetric) -> Condition:
     Raises:
         ValueError: If it would replace the own reward of a third-party task.
     """
-    threshold = config.find(groups.Threshold)
-    if threshold is None:
+    if config.condition == 'horizon':
         return Horizon(metric.spec.episode_ticks, metric.reward)
     if metric.has_own_reward:
         raise ValueError(
             f'condition threshold would replace {own_reward(metric)}; allowed: none, horizon'
         )
-    return Threshold(metric, threshold.widest_threshold)
+    return Threshold(metric, config.widest_threshold)
 
 
 @dataclass(frozen=True, kw_only=True)

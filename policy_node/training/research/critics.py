@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from policy_node.policies.actor import MLP, Actor
 from policy_node.policies.network_shape import NetworkShape
-from policy_node.training.configuration.groups import Critics
+from policy_node.training.configuration.config import Critics
 from policy_node.training.learners.ddpg import (
     DDPG,
     Critic,
@@ -228,7 +228,7 @@ def hidden_layers(shape: NetworkShape, norm: str) -> NetworkShape:
 
 def critic_loss(options: Critics) -> CriticLoss:
     """Return the loss that the options select."""
-    if options == Critics():
+    if (options.critics, options.norm, options.quantiles) == (1, 'none', 1):
         return CriticLoss()
     if options.quantiles > 1:
         return QuantileLoss(options)
@@ -286,7 +286,7 @@ class AdvantageDDPG(DDPG):
 
     def _make_networks(self, shape: NetworkShape) -> tuple[Actor, nn.Module]:
         actor = Actor(shape)
-        layers = hidden_layers(shape, self.options.critic.norm)
+        layers = hidden_layers(shape, self.config.norm)
         return actor, AdvantageCritic(shape.feature_size, layers, self.config.tick_share)
 
     def _loss_of_critic(self, batch: TensorBatch) -> Tensor:

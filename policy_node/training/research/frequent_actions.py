@@ -219,7 +219,7 @@ class PerturbingCollector(Collector):
 
     def __init__(self, simulation: Simulation, seeds: list[int], config: TrainConfig) -> None:
         super().__init__(simulation, seeds, config)
-        self._parameters = ParameterNoise(self._generator, config.learner.exploration.noise_std)
+        self._parameters = ParameterNoise(self._generator, config.noise_std)
 
     def _begin(self, policy: Policy) -> Policy:
         self._parameters.share = self.exploration

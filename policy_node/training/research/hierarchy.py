@@ -29,7 +29,6 @@ from policy_node.policies.actor import Actor
 from policy_node.policies.network_shape import NORMALIZED_CLIP, NetworkShape
 from policy_node.policies.policy import Policy
 from policy_node.training.configuration.config import TrainConfig
-from policy_node.training.configuration.groups import Hierarchical
 from policy_node.training.experience.collector import Collector, Observations
 from policy_node.training.experience.experience import Experience
 from policy_node.training.experience.hindsight import SOURCES, draw_sources, goals_of
@@ -196,8 +195,7 @@ class GuidedCollector(Collector):
     ) -> None:
         columns = subgoal_columns(simulation.spec.goal.size)
         super().__init__(simulation, seeds, config, extra_columns=columns)
-        noise = config.learner.exploration
-        self._guide = Guide(every, self._generator, noise.noise_std, noise.random_epsilon)
+        self._guide = Guide(every, self._generator, config.noise_std, config.random_epsilon)
         self._proposer: Proposer | None = None
 
     def _begin(self, policy: Policy) -> Policy:
@@ -316,8 +314,7 @@ class HierarchicalExperience(Experience):
         """Draw the transitions of one update of both levels."""
         del env_steps
         config, mixture = self.config, self.mixture()
-        assert isinstance(config.learner, Hierarchical)
-        every = config.learner.subgoal_every
+        every = config.subgoal_every
         low = self._draw(with_subgoals(mixture))
         rows = self._draw_rows()
         subgoals = SubgoalSampler(self._sampler, every, config.lowest_value)
@@ -345,7 +342,7 @@ class HighLevel(DDPG):
     ) -> None:
         shape = replace(shape, action_size=shape.goal_size)
         # A penalty of large actions would prefer goals in the middle of all goals.
-        config = replace(config, learner=replace(config.learner, action_l2=0.0))
+        config = replace(config, action_l2=0.0)
         super().__init__(shape, config, device, workers, parts)
         self.actor.observation_normalizer = actor.observation_normalizer
         self.actor.goal_normalizer = actor.goal_normalizer
@@ -415,9 +412,8 @@ class HierarchicalDDPG(DDPG):
         return {'eval_guided': both}
 
     def _guided(self, actor: Policy, proposer: Proposer) -> GuidedPolicy:
-        assert isinstance(self.options, Hierarchical)
-        spec = task_spec(self.config.task, control_hz=self.config.collect.control_hz)
-        return GuidedPolicy(actor, proposer, self.options.subgoal_every, spec.episode_ticks)
+        spec = task_spec(self.config.task, control_hz=self.config.control_hz)
+        return GuidedPolicy(actor, proposer, self.config.subgoal_every, spec.episode_ticks)
 
     def modules(self) -> dict[str, nn.Module]:
         """Return the modules that a training state contains, by name."""

@@ -17,7 +17,6 @@ from msgs_spec.arrays import Array32
 from policy_node.policies.actor import MLP, Actor
 from policy_node.policies.network_shape import NetworkShape
 from policy_node.training.configuration.config import TrainConfig
-from policy_node.training.configuration.groups import Ppo
 from policy_node.training.experience.replay import Transitions
 from policy_node.training.learners.actor_critic import ActorCritic, Losses
 from policy_node.training.machine import Workers
@@ -40,12 +39,11 @@ class PPO(ActorCritic):
     def __init__(
         self, shape: NetworkShape, config: TrainConfig, device: torch.device, workers: Workers
     ) -> None:
-        options = config.find(Ppo) or Ppo()
-        self._noise_std = options.noise_std
+        self._noise_std = config.noise_std
         actor, critic = Actor(shape), MLP(shape.feature_size, 1, shape)
-        torch.nn.init.constant_(critic.output.bias, options.first_value)
+        torch.nn.init.constant_(critic.output.bias, config.first_value)
         with torch.no_grad():
-            actor.network.output.weight.mul_(options.first_action_gain)
+            actor.network.output.weight.mul_(config.first_action_gain)
         super().__init__(actor, critic, config, device, workers)
 
     def update(self, batch: Transitions) -> Losses:
@@ -76,9 +74,7 @@ class PPO(ActorCritic):
         advantage = self.tensor(batch.advantage)
         bounded = ratio.clamp(1.0 - CLIP, 1.0 + CLIP)
         gain = torch.minimum(ratio * advantage, bounded * advantage)
-        loss: Tensor = (
-            -(weight * gain).mean() + self.config.learner.action_l2 * mean.square().mean()
-        )
+        loss: Tensor = -(weight * gain).mean() + self.config.action_l2 * mean.square().mean()
         return loss
 
     @torch.no_grad()

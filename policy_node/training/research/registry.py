@@ -14,8 +14,7 @@ from fetch_hand_sim.simulation import Simulation
 from fetch_hand_sim.simulation.rewards import GoalMetric
 from msgs_spec.tasks import TaskSpec
 from policy_node.policies.network_shape import NetworkShape
-from policy_node.training.configuration import groups
-from policy_node.training.configuration.config import TrainConfig
+from policy_node.training.configuration.config import DEFAULTS, TrainConfig
 from policy_node.training.experience.collector import Collector
 from policy_node.training.experience.experience import Experience
 from policy_node.training.experience.replay import Weigh, has_moved
@@ -84,15 +83,14 @@ __all__ = [
     'without_input',
 ]
 
-# Learners that take the place of `DDPG`, by the option that selects them.
-_LEARNERS: dict[type, type[DDPG]] = {
-    groups.Hierarchical: HierarchicalDDPG,
-    groups.Threshold: ConditionedDDPG,
-    groups.Horizon: ConditionedDDPG,
-    groups.Held: HoldingDDPG,
-    groups.Advantages: AdvantageDDPG,
-    groups.Density: WeightedDDPG,
-    groups.Imagined: ImaginingDDPG,
+# Learners that take the place of `DDPG`, by the field that selects them.
+_LEARNERS: dict[str, type[DDPG]] = {
+    'subgoal_every': HierarchicalDDPG,
+    'condition': ConditionedDDPG,
+    'longest_hold': HoldingDDPG,
+    'advantage': AdvantageDDPG,
+    'importance': WeightedDDPG,
+    'subgoal_prior': ImaginingDDPG,
 }
 
 
@@ -101,22 +99,22 @@ def make_simulation(config: TrainConfig, num_envs: int, num_threads: int) -> Sim
     options: dict[str, Any] = {
         'num_envs': num_envs,
         'num_threads': num_threads,
-        'reward_type': 'dense' if config.find(groups.Dense) else 'sparse',
-        'success_rule': config.collect.success_rule,
-        'control_hz': config.collect.control_hz,
-        'disturbances': config.collect.disturbances,
+        'reward_type': config.reward_type,
+        'success_rule': config.success_rule,
+        'control_hz': config.control_hz,
+        'disturbances': config.disturbances,
     }
-    return (GambleSimulation if config.collect.gamble else Simulation)(config.task, **options)
+    return (GambleSimulation if config.gamble else Simulation)(config.task, **options)
 
 
 def make_collector(simulation: Simulation, seeds: list[int], config: TrainConfig) -> Collector:
     """Return the collector; arguments as `Collector`."""
-    if held := config.find(groups.Held):
-        return HoldingCollector(simulation, seeds, config, held.longest_hold)
-    if guided := config.find(groups.Hierarchical):
-        return GuidedCollector(simulation, seeds, config, guided.subgoal_every)
-    noisy_weights = config.learner.exploration.parameter_noise
-    return (PerturbingCollector if noisy_weights else Collector)(simulation, seeds, config)
+    if config.longest_hold > 1:
+        return HoldingCollector(simulation, seeds, config, config.longest_hold)
+    if config.subgoal_every:
+        return GuidedCollector(simulation, seeds, config, config.subgoal_every)
+    kind = PerturbingCollector if config.parameter_noise else Collector
+    return kind(simulation, seeds, config)
 
 
 def make_sampler(config: TrainConfig, metric: GoalMetric) -> TransitionSampler:
@@ -126,20 +124,19 @@ def make_sampler(config: TrainConfig, metric: GoalMetric) -> TransitionSampler:
         ValueError: If the configuration replaces the own reward of a third-party task.
     """
     fields = sampler_fields(config, metric)
-    if held := config.find(groups.Held):
-        return HoldingSampler(**fields | {'most_steps': held.longest_hold})
-    if chosen := config.find(groups.Chosen):
-        return ChoosingSampler(**fields, choice=chosen.goal_choice)
-    if config.find(groups.Threshold) or config.find(groups.Horizon):
+    if config.longest_hold > 1:
+        return HoldingSampler(**fields | {'most_steps': config.longest_hold})
+    if config.goal_choice != 'uniform':
+        return ChoosingSampler(**fields, choice=config.goal_choice)
+    if config.condition != 'none':
         return ConditionedSampler(**fields, condition=make_condition(config, metric))
-    returns = config.find(groups.Returns)
-    if returns and returns.correction == 'lambda':
-        return LambdaSampler(**fields, trace=returns.trace)
-    if returns and returns.correction == 'cut':
+    if config.correction == 'lambda':
+        return LambdaSampler(**fields, trace=config.trace)
+    if config.correction == 'cut':
         return CuttingSampler(**fields)
-    if config.find(groups.Hierarchical):
+    if config.subgoal_every:
         return TransitionSampler(**fields, sources=LOW_SOURCES)
-    if config.find(groups.Ppo):
+    if config.algorithm == 'ppo':
         return RolloutSampler(**fields, metric=metric)
     return TransitionSampler(**fields)
 
@@ -155,11 +152,11 @@ def make_learner(
     """Return the learner and its experience."""
     common = config, spec, workers, sampler, generator
     weigh = _weights_of(config, spec)
-    if config.find(groups.Ppo):
+    if config.algorithm == 'ppo':
         ppo = PPO(network_shape(config), config, device, workers)
         return ppo, OnPolicyExperience(*common, ppo, weigh)
     learner = make_ddpg(network_shape(config), config, device, workers)
-    if config.find(groups.Hierarchical):
+    if config.subgoal_every:
         columns = subgoal_columns(spec.goal.size)
         return learner, HierarchicalExperience(*common, columns, weigh)
     if isinstance(sampler, JudgedSampler):
@@ -173,11 +170,9 @@ def make_ddpg(
     shape: NetworkShape, config: TrainConfig, device: torch.device, workers: Workers
 ) -> DDPG:
     """Return `DDPG` or the learner that takes its place; arguments as `DDPG`."""
-    options = config.learner
-    assert isinstance(options, groups.OffPolicy)
-    kinds = (kind for option, kind in _LEARNERS.items() if config.find(option))
-    targets = NoTargets if options.target == 'none' else TargetNetworks
-    parts = Parts(critic_loss(options.critic), targets)
+    kinds = (kind for name, kind in _LEARNERS.items() if getattr(config, name) != DEFAULTS[name])
+    targets = NoTargets if config.target == 'none' else TargetNetworks
+    parts = Parts(critic_loss(config), targets)
     return next(kinds, DDPG)(shape, config, device, workers, parts)
 
 
@@ -188,11 +183,11 @@ def network_shape(config: TrainConfig) -> NetworkShape:
 
 def _extra_actions(config: TrainConfig) -> int:
     """Return the number of outputs of the actor beside the action: the length of an action."""
-    return int(config.find(groups.Held) is not None)
+    return int(config.longest_hold > 1)
 
 
 def _weights_of(config: TrainConfig, spec: TaskSpec) -> Weigh:
     """Return the function that finds episodes with a motion, the landing of a gamble left out."""
-    if not config.collect.gamble:
+    if not config.gamble:
         return has_moved
     return lambda episodes: has_moved(without_landings(episodes, spec))

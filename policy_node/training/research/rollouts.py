@@ -33,7 +33,6 @@ from fetch_hand_sim.simulation.rewards import GoalMetric
 from msgs_spec.arrays import Array, Array32
 from msgs_spec.tasks import TaskSpec
 from policy_node.training.configuration.config import TrainConfig
-from policy_node.training.configuration.groups import Ppo
 from policy_node.training.experience.experience import Experience
 from policy_node.training.experience.hindsight import (
     RewardFunction,
@@ -337,11 +336,10 @@ class OnPolicyExperience(Experience):
         weigh: Weigh = has_moved,
     ) -> None:
         super().__init__(config, spec, workers, sampler, generator, weigh=weigh)
-        options = config.find(Ppo) or Ppo()
-        limits = options.gamma, options.trace, options.importance == 'decision'
+        limits = config.gamma, config.trace, config.importance == 'decision'
         self._maker = RolloutMaker(critique, sampler.compute_reward, *limits)
         self._metric = sampler.metric if isinstance(sampler, RolloutSampler) else None
-        self._newest = workers.share(config.collect.num_envs)
+        self._newest = workers.share(config.num_envs)
         self._rollouts: Rollouts | None = None
         self._made_after = -1
         self._weight_up_to = np.zeros(0)
@@ -351,10 +349,10 @@ class OnPolicyExperience(Experience):
         if self._rollouts is None or env_steps != self._made_after:
             self._rollouts, self._made_after = self._roll_out(), env_steps
             self._weight_up_to = np.cumsum(self._weigh(self._rollouts.episodes))
-        return self._rollouts.draw(self._draw_rows(), self.config.learner.gamma, self.generator)
+        return self._rollouts.draw(self._draw_rows(), self.config.gamma, self.generator)
 
     def _draw_rows(self) -> NDArray[np.int64]:
-        generator, count, share = self.generator, self.batch_size, self.config.replay.moved_share
+        generator, count, share = self.generator, self.batch_size, self.config.moved_share
         row = generator.integers(len(self._weight_up_to), size=count)
         if share > 0.0 and self._weight_up_to[-1] > 0.0:
             chosen = np.flatnonzero(generator.random(count) < share)
@@ -376,7 +374,7 @@ class OnPolicyExperience(Experience):
         episodes = self.replay.newest(min(self._newest, self.replay.last_added))
         mixture = super().mixture()
         mixture.pop('real', None)
-        copies, outcomes = self.config.goals.hindsight_k if mixture else 0, None
+        copies, outcomes = self.config.hindsight_k if mixture else 0, None
         if _OUTCOME in mixture and self._metric is not None:
             past = self.replay.newest(_EPISODES)
             outcomes = Outcomes.of(past, self._metric, self.generator)

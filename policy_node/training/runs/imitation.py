@@ -22,7 +22,6 @@ from msgs_spec.disturbances import read_disturbances
 from policy_node.policies.actor import Actor
 from policy_node.policies.policy import past_after
 from policy_node.training.configuration.config import TrainConfig
-from policy_node.training.configuration.groups import Imitation
 from policy_node.training.evaluation import EpisodeOutcomes, Evaluator, training_seeds
 from policy_node.training.learners.ddpg import Critic
 from policy_node.training.machine import Workers, split_threads
@@ -60,9 +59,8 @@ class Answers:
 
 
 def _scaled(config: TrainConfig, scale: float) -> TrainConfig:
-    scaled = read_disturbances(config.collect.disturbances).scaled(scale)
-    collect = replace(config.collect, disturbances=json.dumps(scaled.as_dict()))
-    return replace(config, collect=collect)
+    scaled = read_disturbances(config.disturbances).scaled(scale)
+    return replace(config, disturbances=json.dumps(scaled.as_dict()))
 
 
 class ImitationTrainer:
@@ -91,19 +89,17 @@ class ImitationTrainer:
     ) -> None:
         if workers.world_size > 1:
             raise ValueError(f'{workers.world_size} workers; algorithm imitation needs 1')
-        assert isinstance(config.learner, Imitation)
         self.config, self.workers, self.counters = config, workers, Counters()
-        self._learner = config.learner
         origin = init_from.origin
         self._folder = RunFolder(output, config, workers, command, source_revision, origin)
         threads, torch_threads = split_threads(config)
         torch.set_num_threads(torch_threads)
         torch.manual_seed(config.seed)
         self._simulations = [
-            make_simulation(_scaled(config, scale), config.collect.num_envs, threads)
-            for scale in config.learner.disturbance_scales
+            make_simulation(_scaled(config, scale), config.num_envs, threads)
+            for scale in config.disturbance_scales
         ]
-        count = min(config.collect.num_envs, config.run.evaluation_episodes)
+        count = min(config.num_envs, config.evaluation_episodes)
         self._evaluator = Evaluator(make_simulation(config, count, threads), config)
         self.actor = Actor(network_shape(config))
         self.actor.load_state_dict(part_of(init_from.tensors, 'actor'))
@@ -111,15 +107,15 @@ class ImitationTrainer:
         self._imitated = copy.deepcopy(self.actor).requires_grad_(False)
         self._critic = self._make_critic(init_from)
         self._optimizer = torch.optim.Adam(self.actor.network.parameters())
-        shape, capacity = self.actor.shape, config.replay.replay_transitions
+        shape, capacity = self.actor.shape, config.replay_transitions
         sizes = [shape.feature_size, shape.action_size]
         if self._critic is not None:
             sizes.append(shape.feature_size)
-        self._answers = Answers(min(capacity, config.run.total_steps), sizes)
+        self._answers = Answers(min(capacity, config.total_steps), sizes)
         self._stop_reason = ''
 
     def _make_critic(self, init_from: InitialNetworks) -> Critic | None:
-        if not self._learner.value_weight:
+        if not self.config.value_weight:
             return None
         shape = self.actor.shape
         critic = Critic(shape.feature_size + shape.action_size, shape)
@@ -128,7 +124,7 @@ class ImitationTrainer:
         except RuntimeError:
             name = init_from.origin['name']
             raise ValueError(
-                f'value_weight {self._learner.value_weight}: {name} has no single critic beside it'
+                f'value_weight {self.config.value_weight}: {name} has no single critic beside it'
             ) from None
         return critic.requires_grad_(False)
 
@@ -153,15 +149,13 @@ class ImitationTrainer:
             reason = reason or self._reason_to_stop()
             if outcomes is not None or reason:
                 self._folder.save_actor(LATEST_FILE, self.actor, counters.env_steps)
-            row = progress_row(counters, success, outcomes, config.collect.success_rule, [])
+            row = progress_row(counters, success, outcomes, config.success_rule, [])
             seconds = max(time.monotonic() - before, 1e-9)
             ticks = self._simulations[0].spec.episode_ticks
             row |= {
                 'actor_loss': loss,
-                'steps_per_second': config.collect.num_envs * ticks / seconds,
-                'samples_per_second': config.learner.updates_per_cycle
-                * config.learner.batch_size
-                / seconds,
+                'steps_per_second': config.num_envs * ticks / seconds,
+                'samples_per_second': config.updates_per_cycle * config.batch_size / seconds,
             }
             if log is not None:
                 log.write(row)
@@ -170,7 +164,7 @@ class ImitationTrainer:
 
     def _collect(self) -> float:
         """Run one episode of each simulation and store the answers; return the success rate."""
-        count = self.config.collect.num_envs
+        count = self.config.num_envs
         cycle = self.counters.episodes // count
         simulation = self._simulations[cycle % len(self._simulations)]
         ticks = simulation.spec.episode_ticks
@@ -210,35 +204,35 @@ class ImitationTrainer:
 
     def _learn(self) -> float:
         """Fit the actor to stored answers; return the mean loss."""
-        learner, total = self._learner, 0.0
-        left = max(1.0 - self.counters.env_steps / self.config.run.total_steps, 0.0)
-        share = learner.final_learning_rate + (1.0 - learner.final_learning_rate) * left
+        config, total = self.config, 0.0
+        left = max(1.0 - self.counters.env_steps / config.total_steps, 0.0)
+        share = config.final_learning_rate + (1.0 - config.final_learning_rate) * left
         for group in self._optimizer.param_groups:
-            group['lr'] = learner.learning_rate * share
-        for _ in range(learner.updates_per_cycle):
-            inputs, answers, *states = self._answers.draw(learner.batch_size)
+            group['lr'] = config.learning_rate * share
+        for _ in range(config.updates_per_cycle):
+            inputs, answers, *states = self._answers.draw(config.batch_size)
             actions = self.actor(inputs)
             loss = (actions - answers).square().mean()
             if self._critic is not None:
                 lost = self._critic(*states, answers) - self._critic(*states, actions)
                 # An action of higher value than the imitated one exploits errors of the critic.
-                loss = loss + learner.value_weight * lost.clamp(min=0.0).mean()
+                loss = loss + config.value_weight * lost.clamp(min=0.0).mean()
             self._optimizer.zero_grad()
             loss.backward()
             self._optimizer.step()
             total += loss.item()
-        self.counters.updates += learner.updates_per_cycle
-        return total / max(learner.updates_per_cycle, 1)
+        self.counters.updates += config.updates_per_cycle
+        return total / max(config.updates_per_cycle, 1)
 
     def _evaluate(self, is_last: bool) -> EpisodeOutcomes | None:
         counters = self.counters
         if not is_last and counters.env_steps < counters.next_evaluation:
             return None
-        counters.next_evaluation = counters.env_steps + self.config.run.evaluate_every
+        counters.next_evaluation = counters.env_steps + self.config.evaluate_every
         outcomes = self._evaluator.evaluate(self.actor, -1.0)
         self._folder.keep_best(outcomes, self.actor, counters)
         return outcomes
 
     def _reason_to_stop(self) -> str:
-        _, ended = ended_by(self.config.run, self.counters) or ('', '')
+        _, ended = ended_by(self.config, self.counters) or ('', '')
         return self._stop_reason or ended

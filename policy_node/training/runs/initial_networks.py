@@ -12,7 +12,6 @@ from msgs_spec.tasks import task_spec
 from policy_node.policies.network_shape import NetworkShape
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.flat import to_flat
-from policy_node.training.configuration.groups import Critics
 from policy_node.training.learners.actor_critic import ActorCritic, first_weights, with_inputs
 from policy_node.training.research.registry import (
     Ensemble,
@@ -59,7 +58,7 @@ class InitialNetworks:
 
     def require_fit(self, config: TrainConfig) -> None:
         """Raise ValueError if a run with this configuration cannot start from these networks."""
-        ours = _described(network_shape(config), config.network.goal_features)
+        ours = _described(network_shape(config), config.goal_features)
         theirs = _described(self._shape_in(config), self.goal_features)
         differing = [
             f'{name} {old}, now {ours[name]}' for name, old in theirs.items() if old != ours[name]
@@ -96,15 +95,14 @@ class InitialNetworks:
         if acting_input(config) is not None:
             tensors = with_inputs(fitted.tensors, shape.feature_size, 1)
             fitted = replace(fitted, tensors=tensors)
-        critic = config.find(Critics) or Critics()
         values = {name: to_flat(config)[name] for name in self.valued_by}
-        if critic.norm != self.norm or values != self.valued_by:
+        if config.norm != self.norm or values != self.valued_by:
             return fitted.without_critic()
-        return fitted.with_critics(critic.critics)
+        return fitted.with_critics(config.critics)
 
     def _shape_in(self, config: TrainConfig) -> NetworkShape:
         """Return the shape with the past actions of a run, or with their own if they have some."""
-        past = self.shape.past_actions or config.network.past_actions
+        past = self.shape.past_actions or config.past_actions
         return replace(self.shape, past_actions=past)
 
     def _with_past_of(self, config: TrainConfig) -> InitialNetworks:

@@ -14,7 +14,6 @@ from policy_node.policies.checkpoint import ActorInfo
 from policy_node.policies.loading import actor_path
 from policy_node.training.configuration.config import TrainConfig, unusual_networks
 from policy_node.training.configuration.flat import config_from_dict, to_flat
-from policy_node.training.configuration.groups import Critics
 from policy_node.training.research.registry import acting_input, network_shape, without_input
 from policy_node.training.runs.initial_networks import VALUED_BY, InitialNetworks
 from policy_node.training.runs.run_folder import STATE_FILE, companion_file
@@ -60,7 +59,7 @@ def _of_run(folder: Path) -> InitialNetworks:
         'command': state.extra.get('command', ''),
         'init_from': state.extra.get('init_from', {}),
     }
-    kind = config.network.goal_features, _norm(config)
+    kind = config.goal_features, _norm(config)
     return InitialNetworks(tensors, network_shape(config), *kind, origin, _valued_by(config))
 
 
@@ -126,7 +125,7 @@ def _valued_by(config: TrainConfig) -> dict[str, Any]:
 
 
 def _norm(config: TrainConfig) -> str:
-    return (config.find(Critics) or Critics()).norm
+    return config.norm
 
 
 def _unconditioned(tensors: dict[str, Tensor], config: TrainConfig) -> dict[str, Tensor]:

@@ -25,7 +25,6 @@ from node_runtime.signals import on_stop_signals
 from node_runtime.source_revision import source_revision
 from policy_node.training.configuration.config import TrainConfig, idle_parts
 from policy_node.training.configuration.flat import config_from_dict, removed_fields, to_flat
-from policy_node.training.configuration.groups import Imitation
 from policy_node.training.experience.replay import Episodes
 from policy_node.training.machine import (
     available_memory,
@@ -140,7 +139,7 @@ def train_run(
         CommandError: If training fails; the last checkpoint stays.
     """
     require_extra('train')
-    networks = _initial_networks(config) if config.network.init_from and not resume else None
+    networks = _initial_networks(config) if config.init_from and not resume else None
     with lock_run(output) if is_first_worker() else contextlib.nullcontext():
         if not resume and (output / STATE_FILE).exists():
             raise UsageError(f'{output} contains a run. Use --resume or choose another folder')
@@ -170,13 +169,11 @@ def train_run(
 
 def _initial_networks(config: TrainConfig) -> InitialNetworks:
     try:
-        networks = read_initial_networks(config.network.init_from).fitted(config)
+        networks = read_initial_networks(config.init_from).fitted(config)
     except ValueError as error:
         raise UsageError(str(error)) from None
-    if not networks.has_critic and not isinstance(config.learner, Imitation):
-        complain(
-            NAME, f'{config.network.init_from} has no critic for this run; a new one learns first'
-        )
+    if not networks.has_critic and config.algorithm != 'imitation':
+        complain(NAME, f'{config.init_from} has no critic for this run; a new one learns first')
     return networks
 
 
@@ -194,8 +191,8 @@ def _make_trainer(
         UsageError: If something does not fit the configuration or the memory of the machine.
     """
     try:
-        workers = join_workers(choose_device(config.machine.device))
-        if isinstance(config.learner, Imitation):
+        workers = join_workers(choose_device(config.device))
+        if config.algorithm == 'imitation':
             assert networks is not None, 'imitation starts from a policy and is not resumed'
             return ImitationTrainer(config, output, workers, command, source_revision(), networks)
         trainer = Trainer(config, output, workers, command, source_revision(), networks)
@@ -217,7 +214,7 @@ def _make_trainer(
 def _too_large(trainer: Trainer) -> str:
     """Return a warning if the replay will exceed the memory of this worker hours later."""
     replay = trainer.experience.replay
-    left = max(trainer.config.run.total_steps - trainer.counters.env_steps, 0)
+    left = max(trainer.config.total_steps - trainer.counters.env_steps, 0)
     episodes = len(replay) + trainer.workers.share(left) // replay.ticks
     needed = replay.bytes_of(episodes) - replay.bytes_of(len(replay))
     return why_too_large(needed, available_memory())
@@ -226,13 +223,13 @@ def _too_large(trainer: Trainer) -> str:
 def _train(
     trainer: AnyTrainer, output: Path, command: str, caller: Caller | None, *, resume: bool
 ) -> Ending:
-    log, run = None, trainer.config.run
+    log, config = None, trainer.config
     if trainer.workers.is_first:
         _prepare_folder(trainer, output, command, resume)
         log = RunLog(
             output,
-            run.total_steps,
-            run.time_limit,
+            config.total_steps,
+            config.time_limit,
             trainer.counters.env_steps,
             quiet=caller is not None and caller.quiet,
             on_row=_row_listener(trainer, caller),
@@ -250,7 +247,7 @@ def _prepare_folder(trainer: AnyTrainer, output: Path, command: str, resume: boo
     """Set files of an earlier run aside, record the command and warn of idle parts."""
     if not resume and (note := set_former_run_aside(output)):
         complain(NAME, note)
-    if not resume or trainer.counters.env_steps < trainer.config.run.total_steps:
+    if not resume or trainer.counters.env_steps < trainer.config.total_steps:
         # One line for each part of the run.
         with (output / COMMAND_FILE).open('a' if resume else 'w') as file:
             file.write(command + '\n')

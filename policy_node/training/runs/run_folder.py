@@ -93,7 +93,7 @@ class RunFolder:
 
     def keep_best(self, outcomes: EpisodeOutcomes, actor: Actor, counters: Counters) -> None:
         """Save an evaluated actor if its success is higher, or equal with a higher return."""
-        rule = self.config.collect.success_rule
+        rule = self.config.success_rule
         success = success_rate(outcomes, rule)
         mean_return = float(outcomes.episode_return.mean())
         if (success, mean_return) <= (counters.best_success, counters.best_return):
@@ -110,13 +110,13 @@ class RunFolder:
         If the actor is missing, damaged, of another task or had another evaluation, the next
         evaluated actor replaces it.
         """
-        file, rule = self.path / BEST_FILE, self.config.collect.success_rule
+        file, rule = self.path / BEST_FILE, self.config.success_rule
         if counters.best_success < 0 and not file.is_file():
             return
         try:
             found = checkpoint.read(file, self.config.task).info.success
             episodes, success = found.get('episodes'), found.get('last_step')
-            is_short = is_finite(episodes) and episodes < self.config.run.evaluation_episodes
+            is_short = is_finite(episodes) and episodes < self.config.evaluation_episodes
             if is_short or found.get('rule', rule) != rule:
                 raise ValueError(f'{file} had another evaluation')
         except ValueError as error:
@@ -134,7 +134,7 @@ class RunFolder:
     ) -> None:
         """Save every `checkpoint_seconds`, the replay less often; report a full disk."""
         now = time.monotonic()
-        if now - self._last_checkpoint < self.config.run.checkpoint_seconds:
+        if now - self._last_checkpoint < self.config.checkpoint_seconds:
             return
         try:
             due = now - self._last_replay >= REPLAY_SECONDS
@@ -157,7 +157,7 @@ class RunFolder:
         self._last_checkpoint = time.monotonic()
         if with_replay:
             self._last_replay = self._last_checkpoint
-            kept = self.workers.share(self.config.replay.kept_transitions)
+            kept = self.workers.share(self.config.kept_transitions)
             save_replay(self.replay_file(), experience.replay, kept)
         if self.workers.is_first:
             self.save_actor(LATEST_FILE, learner.evaluation_actor(), counters.env_steps)
@@ -175,17 +175,17 @@ class RunFolder:
             observation_layout=checkpoint.observation_layout(spec),
             goal_size=spec.goal.size,
             action_size=spec.robot.action_size,
-            hidden_sizes=config.network.hidden_sizes,
-            layer_norm=config.network.layer_norm,
-            control_hz=config.collect.control_hz,
+            hidden_sizes=config.hidden_sizes,
+            layer_norm=config.layer_norm,
+            control_hz=config.control_hz,
             seed=config.seed,
             command=self.command,
             source_revision=self.source_revision,
             env_steps=env_steps,
             config=to_flat(config),
             success=success or {},
-            goal_features=config.network.goal_features,
+            goal_features=config.goal_features,
             init_from=self.init_from,
-            past_actions=config.network.past_actions,
+            past_actions=config.past_actions,
         )
         checkpoint.save(self.path / name, plain_actor(actor, config), info)

@@ -22,7 +22,6 @@ from node_runtime.command_line import complain
 from policy_node.policies.actor import Actor
 from policy_node.policies.policy import Policy
 from policy_node.training.configuration.config import TrainConfig
-from policy_node.training.configuration.groups import Critics, Ppo
 from policy_node.training.evaluation import EpisodeOutcomes, Evaluator, training_seeds
 from policy_node.training.experience.episode_files import load_replay
 from policy_node.training.experience.replay import Episodes
@@ -87,7 +86,7 @@ class Trainer:
         self.workers = workers
         origin = {} if init_from is None else init_from.origin
         self._folder = RunFolder(output, config, workers, command, source_revision, origin)
-        self.device = choose_device(config.machine.device)
+        self.device = choose_device(config.device)
         self._simulation_threads, torch_threads = split_threads(config)
         torch.set_num_threads(torch_threads)
         torch.manual_seed(config.seed)
@@ -106,9 +105,9 @@ class Trainer:
 
     def _build_simulations(self) -> None:
         config, share = self.config, self.workers.share
-        threads, num_envs = self._simulation_threads, share(config.collect.num_envs)
+        threads, num_envs = self._simulation_threads, share(config.num_envs)
         self.simulation = make_simulation(config, num_envs, threads)
-        count = min(num_envs, config.run.evaluation_episodes)
+        count = min(num_envs, config.evaluation_episodes)
         self._evaluator = Evaluator(make_simulation(config, count, threads), config)
         self.spec = self.simulation.spec
 
@@ -152,7 +151,7 @@ class Trainer:
         state = load_state(path, self.learner, self.experience.statistics)
         self.counters = counters = state.counters
         # The new configuration may evaluate more often.
-        soonest = counters.env_steps + self.config.run.evaluate_every
+        soonest = counters.env_steps + self.config.evaluate_every
         counters.next_evaluation = min(counters.next_evaluation, soonest)
         self._part_noise()
         self._narrow()
@@ -162,7 +161,7 @@ class Trainer:
         self._folder.read_best(self.counters)
         # The state contains no simulations. Use new seeds, so that no episode is repeated.
         self.experience.generator = self._seed(self.counters.env_steps)
-        limits = (self.counters.env_steps, self.config.replay.replay_transitions, MOST_REFILLED)
+        limits = (self.counters.env_steps, self.config.replay_transitions, MOST_REFILLED)
         held = self.experience.replay.capacity * self.spec.episode_ticks
         self._steps_to_refill = min(self.workers.share(min(limits)), held)
         file = self._folder.replay_file()
@@ -178,9 +177,9 @@ class Trainer:
     def _let_critic_learn_first(self) -> None:
         """Train only the critics at first, if some of them started from random weights."""
         origin = self._folder.init_from
-        critics = (self.config.find(Critics) or Critics()).critics
+        critics = self.config.critics
         known = origin.get('critics', critics if origin.get('critic', True) else 0)
-        if known < critics and self.config.learner.critic_first == 0:
+        if known < critics and self.config.critic_first == 0:
             self.learner.critic_first = CRITIC_FIRST
 
     def add_experience(self, episodes: Episodes) -> None:
@@ -211,7 +210,7 @@ class Trainer:
             return f'{reason} before; give another {field} to go on'
         self._clock = RunClock(self.counters)
         with _collecting_thread() as executor:
-            submit = executor.submit if self.config.machine.overlap else _run_now
+            submit = executor.submit if self.config.overlap else _run_now
             collected = self._collect_first(submit)
             if collected is None:
                 self.save()
@@ -228,7 +227,7 @@ class Trainer:
         """Store and learn from the episodes of one cycle; collect those of the next meanwhile."""
         before = time.monotonic()
         self._store(collected)
-        if self.config.machine.overlap:
+        if self.config.overlap:
             # At the end, evaluate the actor after this cycle, not before it.
             may_evaluate = self._ended() is None
             job = submit(self._collect, *self._prepare_collection(may_evaluate))
@@ -238,7 +237,7 @@ class Trainer:
             job = submit(self._collect, *self._prepare_collection())
         collected = self._collect_or_explain(job)
         self._clock.update()
-        is_trained = self.counters.updates > 0 or bool(self.config.network.init_from)
+        is_trained = self.counters.updates > 0 or bool(self.config.init_from)
         if collected.evaluation is None and is_trained and self._ended():
             # Evaluate the last actor.
             collected = submit(self._evaluate, collected, self._actor_to_evaluate()).result()
@@ -250,7 +249,7 @@ class Trainer:
     def _warn_of_rewards(self, episodes: Episodes) -> None:
         """Warn if rewards of a third-party task exceed 0: values are clipped to 0."""
         metric = self.simulation.metric
-        if isinstance(self.config.learner, Ppo) or not metric.has_own_reward:
+        if self.config.algorithm == 'ppo' or not metric.has_own_reward:
             return
         achieved = episodes.achieved_goal[:, -1].astype(np.float64)
         highest = metric.reward(achieved, episodes.desired_goal.astype(np.float64)).max()
@@ -283,7 +282,7 @@ class Trainer:
         self.collector.exploration = self._exploration()
         actor, evaluated = self.learner.acting_policy(), None
         if may_evaluate and counters.updates > 0 and steps >= counters.next_evaluation:
-            counters.next_evaluation = steps + self.config.run.evaluate_every
+            counters.next_evaluation = steps + self.config.evaluate_every
             evaluated = self._actor_to_evaluate()
         return actor, evaluated
 
@@ -306,8 +305,8 @@ class Trainer:
 
     def _exploration(self) -> float:
         """Return the present share of exploration noise and random actions."""
-        left = 3.0 * (1.0 - self.counters.env_steps / self.config.run.total_steps)
-        final = self.config.learner.exploration.final_exploration
+        left = 3.0 * (1.0 - self.counters.env_steps / self.config.total_steps)
+        final = self.config.final_exploration
         return final + (1.0 - final) * min(max(left, 0.0), 1.0)
 
     def _collect_or_explain(self, job: Future[Collected]) -> Collected:
@@ -328,23 +327,19 @@ class Trainer:
 
     def _narrow(self) -> None:
         """Set the width of rewarded goals for the progress of the run."""
-        self.experience.narrow(self.counters.env_steps / self.config.run.total_steps)
+        self.experience.narrow(self.counters.env_steps / self.config.total_steps)
 
     def _learn(self) -> list[Losses]:
-        first = (
-            self.workers.share(self.config.replay.learning_starts)
-            if self.counters.updates == 0
-            else 0
-        )
+        first = self.workers.share(self.config.learning_starts) if self.counters.updates == 0 else 0
         # The replay holds whole episodes.
         first = min(first, self.experience.replay.capacity * self.spec.episode_ticks)
         if self.workers.any(self.experience.transitions < max(first, 1)):
             return []
         steps = self.counters.env_steps
-        self.learner.set_progress(steps / self.config.run.total_steps)
+        self.learner.set_progress(steps / self.config.total_steps)
         losses = [
             self.learner.update(self.experience.batch(steps))
-            for _ in range(self.config.learner.updates_per_cycle)
+            for _ in range(self.config.updates_per_cycle)
         ]
         self.learner.average()
         self.counters.updates = self.learner.updates
@@ -360,7 +355,7 @@ class Trainer:
 
     def _ended(self) -> tuple[str, str] | None:
         """Return the field that ends the run and the reason in words, or None."""
-        return ended_by(self.config.run, self.counters)
+        return ended_by(self.config, self.counters)
 
     def _reason_to_stop(self) -> str:
         _, ended = self._ended() or ('', '')
@@ -378,7 +373,7 @@ class Trainer:
     def _row(
         self, collected: Collected, losses: list[Losses], seconds: float
     ) -> dict[str, float | None]:
-        workers, rule = self.workers.world_size, self.config.collect.success_rule
+        workers, rule = self.workers.world_size, self.config.success_rule
         success, outcomes = collected.train_success, collected.evaluation
         row = progress_row(self.counters, success, outcomes, rule, losses)
         steps = self.simulation.num_envs * self.spec.episode_ticks * workers

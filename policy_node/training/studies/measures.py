@@ -69,8 +69,8 @@ def measure_run(job: Job, command: str) -> dict[str, Any]:
             f'{job.folder / PROGRESS_FILE} contains no evaluation. '
             f'Remove {job.folder} to train it again.'
         )
-    samples = rows[-1]['updates'] * config.learner.batch_size
-    ticks, last = ticks_of_40_ms(config.collect.control_hz), rows[-1]
+    samples = rows[-1]['updates'] * config.batch_size
+    ticks, last = ticks_of_40_ms(config.control_hz), rows[-1]
     curve = Curve(
         np.array([row['env_steps'] / ticks for row in evaluated]),
         np.array([row['eval_success'] for row in evaluated]),
@@ -83,8 +83,8 @@ def measure_run(job: Job, command: str) -> dict[str, Any]:
         'arm': job.arm.name,
         'seed': config.seed,
         'env_steps': int(last['env_steps']),
-        'simulated_seconds': round(last['env_steps'] / config.collect.control_hz, 2),
-        'area': round(area_under(curve, round(config.run.total_steps / ticks)), 4),
+        'simulated_seconds': round(last['env_steps'] / config.control_hz, 2),
+        'area': round(area_under(curve, round(config.total_steps / ticks)), 4),
         f'steps_to_{GOOD_SUCCESS}': int(reached) if np.isfinite(reached) else None,
         'final_success': _final_success(job),
         'final_episodes': job.final_episodes,
@@ -108,9 +108,9 @@ def _final_success(job: Job) -> float | None:
     if not episodes:
         return None
     actor, _ = checkpoint.load(job.folder / LATEST_FILE)
-    count, threads = min(episodes, _MOST_SIMULATIONS), config.machine.simulation_threads
+    count, threads = min(episodes, _MOST_SIMULATIONS), config.simulation_threads
     outcomes = evaluate(make_simulation(config, count, threads), actor, episodes, FIRST_SEED)
-    return success_rate(outcomes, config.collect.success_rule)
+    return success_rate(outcomes, config.success_rule)
 
 
 def area_under(curve: Curve, total_steps: int) -> float:

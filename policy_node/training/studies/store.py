@@ -78,7 +78,7 @@ def holds(runs: Runs, job: Job) -> bool:
 
 def _differing_runs(run: Run, job: Job) -> dict[str, str]:
     """Return the differing fields of two runs of different places; here the start counts too."""
-    before, now = run['config'].get('init_from', ''), job.config.network.init_from
+    before, now = run['config'].get('init_from', ''), job.config.init_from
     start = {} if before == now else {'init_from': f'init_from {before!r}, now {now!r}'}
     stored = {**run['config'], 'seed': job.config.seed}
     return {**differing_fields(stored, job.config), **start}

@@ -146,7 +146,7 @@ class Job:
         """True if the saved state has all steps. The log may be ahead of it."""
         if not self.has_checkpoint:
             return False
-        return read_counters(self.folder / STATE_FILE).env_steps >= self.config.run.total_steps
+        return read_counters(self.folder / STATE_FILE).env_steps >= self.config.total_steps
 
     @property
     def is_ready(self) -> bool:
@@ -156,7 +156,7 @@ class Job:
     @property
     def status(self) -> str:
         """One line of progress."""
-        log, total = self.folder / PROGRESS_FILE, self.config.run.total_steps
+        log, total = self.folder / PROGRESS_FILE, self.config.total_steps
         rows = read_progress(log) if log.is_file() else []
         evaluated = [row['eval_success'] for row in rows if 'eval_success' in row]
         success = f'{evaluated[-1]:.3f}' if evaluated else '-'

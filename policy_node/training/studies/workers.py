@@ -279,8 +279,8 @@ class Ray:
 
     def start(self, job: Job) -> None:
         """Submit the job to the cluster."""
-        cores = max(job.config.machine.simulation_threads, job.config.machine.torch_threads, 1)
-        config, start = job.config, job.config.network.init_from
+        cores = max(job.config.simulation_threads, job.config.torch_threads, 1)
+        config, start = job.config, job.config.init_from
         # Paths must hold in every working directory; shipped actors keep their names.
         if start and Path(start).exists():
             config = changed(config, init_from=str(Path(start).resolve()))

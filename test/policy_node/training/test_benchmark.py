@@ -62,10 +62,7 @@ def test_jobs_come_seed_by_seed_with_all_variants(tmp_path: Path) -> None:
     ]
     assert len({job.folder for job in jobs}) == len(jobs) == 16
     assert jobs[-1].folder == tmp_path / 'FetchPush' / 'ddpg_dense' / 'seed4'
-    arms = {
-        (job.arm.name, to_flat(job.config)['reward_type'], job.config.goals.strategy)
-        for job in jobs
-    }
+    arms = {(job.arm.name, to_flat(job.config)['reward_type'], job.config.strategy) for job in jobs}
     assert arms == {
         ('her_sparse', 'sparse', 'future'),
         ('her_dense', 'dense', 'future'),

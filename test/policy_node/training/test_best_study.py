@@ -57,13 +57,13 @@ def test_every_task_is_trained_with_its_best_recipe_after_what_it_starts_from(
         gains_position = job.config.task.endswith('Full') and start is not None
         assert (to_flat(job.config)['first_distance'] > 1.0) == gains_position
         if start:
-            assert job.config.network.init_from == folder and job.config.replay.learning_starts > 0
+            assert job.config.init_from == folder and job.config.learning_starts > 0
             assert job.after in jobs[:number] and job.after.config.task == start
 
 
 def test_a_task_alone_starts_from_nothing(tmp_path: Path) -> None:
     (job,) = jobs_of('--tasks', 'HandManipulateEggFull', '--output', str(tmp_path))
-    assert job.after is None and job.config.network.init_from == ''
+    assert job.after is None and job.config.init_from == ''
 
 
 def test_the_status_of_a_job_says_how_far_it_is_and_how_long_it_will_take(tmp_path: Path) -> None:
@@ -98,7 +98,7 @@ class Recorder:
         if job.config.task in self.failing:
             return job, Outcome.FAILED
         job.folder.mkdir(parents=True)
-        counters = Counters(env_steps=job.config.run.total_steps)
+        counters = Counters(env_steps=job.config.total_steps)
         state = TrainingState({}, counters, {'config': {}})
         (job.folder / 'training_state.safetensors').write_bytes(state_bytes(state))
         task, arm, seed = job.key

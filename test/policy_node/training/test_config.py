@@ -193,7 +193,7 @@ def test_bad_assignments_are_refused(text: str, match: str) -> None:
         ({'subgoal_every': 9, 'parameter_noise': True}, 'and parameter_noise'),
         ({'subgoal_every': 9, 'importance': 'density'}, 'density. has no effect: it needs algo'),
         ({'subgoal_every': 9, 'init_from': 'FetchReach'}, 'init_from excludes .*subgoal_every'),
-        ({'subgoal_every': 9, **PPO}, 'algorithm ppo excludes subgoal_every'),
+        ({'subgoal_every': 9, **PPO}, 'subgoal_every 9 has no effect: it needs algorithm ddpg'),
         ({'subgoal_prior': 0.1, 'longest_hold': 5}, 'subgoal_prior excludes longest_hold'),
         ({'imagination_interval': 4}, 'has no effect: it needs subgoal_prior other than 0.0'),
         ({**PPO, 'overlap': True}, 'algorithm ppo needs overlap=false'),

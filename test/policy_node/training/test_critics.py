@@ -10,7 +10,7 @@ import torch
 
 from policy_node.policies.actor import MLP
 from policy_node.policies.network_shape import NetworkShape
-from policy_node.training.configuration.groups import Critics
+from policy_node.training.configuration.config import Critics
 from policy_node.training.experience.replay import Transitions
 from policy_node.training.learners.ddpg import DDPG
 from policy_node.training.research.critics import AGGREGATES, Ensemble, critic_loss

@@ -95,7 +95,7 @@ def test_a_batch_follows_the_configuration() -> None:
     achieved[..., 0] = np.arange(3)[:, None]
     episodes = pen_episodes(achieved)
     reward = lambda achieved, desired: -np.ones(len(achieved))  # noqa: E731
-    sampler = TransitionSampler(reward, config.learner.gamma)
+    sampler = TransitionSampler(reward, config.gamma)
     parts = sampler, np.random.default_rng(0)
     experience = Experience(config, PEN, Workers(), *parts)
     experience.replay.add(episodes)

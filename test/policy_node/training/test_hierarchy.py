@@ -171,7 +171,7 @@ SMALL |= {'simulation_threads': 1, 'torch_threads': 1, 'evaluate_every': 400}
 def test_a_run_goes_on_where_it_stopped_and_saves_an_actor_like_any_other(tmp_path: Path) -> None:
     config = recipe_config('FetchReach', 'best', subgoal_every=10, total_steps=1_200, **SMALL)
     trainer = Trainer(config, tmp_path, Workers())
-    log = RunLog(tmp_path, config.run.total_steps, 0.0)
+    log = RunLog(tmp_path, config.total_steps, 0.0)
     trainer.train(log)
     log.close()
     rows = read_progress(tmp_path / 'progress.csv')

@@ -89,8 +89,7 @@ def test_the_actor_is_drawn_to_what_it_does_for_the_subgoal() -> None:
 
     # Until the copy moves for the first time it is the actor as it was.
     before = distance()
-    moving = configured(subgoal_prior=5.0, target_update_interval=1, polyak=0.0)
-    learner.config, learner.options = moving, moving.learner
+    learner.config = configured(subgoal_prior=5.0, target_update_interval=1, polyak=0.0)
     for _ in range(200):
         learner.update(batch)
     assert distance() < 0.1 * before

@@ -31,7 +31,7 @@ def test_each_input_is_answered_in_the_state_in_which_the_action_arrives(tmp_pat
     pairs = 2 * (TASKS[task].episode_ticks - 1)
     inputs, answers = (part[:pairs] for part in trainer._answers._parts)
     # Without other disturbances, the next input contains the state in which the action arrives.
-    imitated, size = load_actor(task, task), config.network.past_actions * 4
+    imitated, size = load_actor(task, task), config.past_actions * 4
     start = trainer.actor.shape.past_start
     seen = torch.cat([inputs[:, :start], inputs[:, start + size :]], dim=1)
     expected = imitated(seen).detach()

@@ -348,7 +348,7 @@ def test_networks_that_do_not_fit_are_rejected_before_anything_is_written(
 @pytest.mark.parametrize('task', [name for name in TASKS if name.startswith('HandManipulate')])
 def test_finetune_starts_from_the_shipped_networks(task: str) -> None:
     config = recipe_config(task, 'finetune')
-    networks = read_initial_networks(config.network.init_from)
+    networks = read_initial_networks(config.init_from)
     networks.require_fit(config)
     assert networks.origin['task'] == task and networks.has_critic
     assert networks.fitted(config).shape == network_shape(config)

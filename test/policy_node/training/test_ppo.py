@@ -180,7 +180,7 @@ def improve(learner: PPO, rollouts: Rollouts, generator: np.random.Generator) ->
     """The updates of one cycle."""
     for _ in range(20):
         row = generator.integers(len(rollouts.episodes), size=256)
-        learner.update(rollouts.draw(row, learner.config.learner.gamma, generator))
+        learner.update(rollouts.draw(row, learner.config.gamma, generator))
     learner.average()
 
 
@@ -190,11 +190,11 @@ def learn(cycles: int, **changes: object) -> tuple[PPO, RolloutMaker]:
     generator = np.random.default_rng(0)
     config = configured(learning_rate=3e-3, action_l2=0.0, gamma=0.5, **changes)
     learner = PPO(NetworkShape(1, 1, 1, (32, 32)), config, torch.device('cpu'), Workers())
-    corrects = config.learner.importance == 'decision'
-    maker = RolloutMaker(learner, reached, config.learner.gamma, 0.95, corrects)
+    corrects = config.importance == 'decision'
+    maker = RolloutMaker(learner, reached, config.gamma, 0.95, corrects)
     for _ in range(cycles):
         episodes = one_step(learner, generator.uniform(-0.8, 0.8, (256, 1)), generator, np.copy)
-        copies = 0 if config.goals.strategy == 'none' else 4
+        copies = 0 if config.strategy == 'none' else 4
         goals = [goals_in_hindsight(episodes, {'random': 1.0}, generator) for _ in range(copies)]
         improve(learner, maker.make(episodes, goals), generator)
     return learner, maker
@@ -229,7 +229,7 @@ def test_outcomes_of_others_teach_to_push_and_own_ones_do_not(source: str, pushe
     config = configured(learning_rate=3e-3, action_l2=0.0, gamma=0.5, first_value=-2.0)
     learner = PPO(NetworkShape(1, 3, 1, (32, 32)), config, torch.device('cpu'), Workers())
     metric = GoalMetric(task_spec('FetchPush'))
-    maker = RolloutMaker(learner, metric.reward, config.learner.gamma, 0.95, False)
+    maker = RolloutMaker(learner, metric.reward, config.gamma, 0.95, False)
     goal = np.full((256, 3), -0.3)
     for _ in range(20):
         episodes = one_step(learner, goal, generator, pushed)
@@ -321,7 +321,7 @@ def test_a_share_of_a_batch_is_from_episodes_that_moved_the_object(share: float)
     )
     cpu = torch.device('cpu')
     _, experience = make_learner(config, spec, cpu, Workers(), sampler, generator)
-    count, ticks = config.collect.num_envs, spec.episode_ticks
+    count, ticks = config.num_envs, spec.episode_ticks
     observation = np.zeros((count, ticks + 1, spec.observation_size), np.float32)
     observation[:, :, 0] = np.arange(count)[:, None]
     achieved = np.zeros((count, ticks + 1, 3), np.float32)

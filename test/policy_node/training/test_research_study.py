@@ -56,13 +56,13 @@ def test_variants_of_a_study_share_all_other_settings(study: Study, tmp_path: Pa
         assert len(jobs) == study.seeds * len(study.arms)
         own = own_fields(study) | {'seed'}
         if 'control_hz' in own:
-            seconds = {job.config.run.total_steps / job.config.collect.control_hz for job in jobs}
+            seconds = {job.config.total_steps / job.config.control_hz for job in jobs}
             assert len(seconds) == 1, 'budgets are the same in simulated time'
         settings = [to_flat(job.config) for job in jobs]
         for name in settings[0].keys() - own:
             assert all(each[name] == settings[0][name] for each in settings), name
         assert len({str(each) for each in settings}) == len({job.folder for job in jobs})
-        machine = jobs[0].config.machine
+        machine = jobs[0].config
         assert machine.simulation_threads == machine.torch_threads == 1 and not machine.overlap
 
 

@@ -116,7 +116,7 @@ def test_a_callback_sees_every_cycle_and_may_end_the_run(tmp_path):
     assert [row['env_steps'] for row in rows] == [400, 800]
     resumed = train('FetchReach', run.folder, resume=True, total_steps=1_200, quiet=True)
     assert resumed.env_steps == 1_200
-    assert resumed.config.collect.num_envs == 8
+    assert resumed.config.num_envs == 8
 
 
 def test_an_exception_of_a_callback_is_raised_and_the_run_is_saved(tmp_path):

@@ -260,7 +260,7 @@ def test_thresholds_of_training_narrow_from_the_first_to_those_of_the_task(tmp_p
     trainer = Trainer(config, tmp_path, Workers())
     trainer.experience.replay.add(trainer.collector.collect(RandomPolicy(4))[0])
     for env_steps, threshold in ((0, 0.2), (1_000, 0.1), (2_000, 0.05), (3_000, 0.05)):
-        trainer.experience.narrow(env_steps / config.run.total_steps)
+        trainer.experience.narrow(env_steps / config.total_steps)
         batch = trainer.experience.batch(env_steps)
         position = batch.next_observation[:, :3].astype(np.float64)
         distance = np.linalg.norm(position - batch.goal, axis=-1)
@@ -338,7 +338,7 @@ def test_weights_that_a_step_has_ruined_stop_the_run_before_they_act_or_are_save
         nonlocal count
         count += 1
         losses = update(batch)  # type: ignore[arg-type]
-        if count == 3 * config.learner.updates_per_cycle:
+        if count == 3 * config.updates_per_cycle:
             with torch.no_grad():
                 trainer.learner.actor.network.output.weight.fill_(float('inf'))
         return losses
