@@ -15,7 +15,7 @@ from typing import Any
 
 from msgs_spec.robots import FETCH
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ, TASKS, GoalKind, TaskSpec
-from policy_node.training.runs.read_networks import steps_behind
+from policy_node.training.runs.initial_networks import steps_behind
 from policy_node.training.studies.published import BEST, CEILINGS, RERUN
 
 ROOT = Path(__file__).resolve().parent.parent

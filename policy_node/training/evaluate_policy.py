@@ -7,22 +7,18 @@ import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
-
-import numpy as np
 
 from fetch_hand_sim.simulation import Simulation
 from msgs_spec.parameters import LARGEST_SEED
 from node_runtime.command_line import (
     EXIT_SUCCESS,
-    CommandError,
     CommandParser,
     progress,
     run_command,
     whole_number,
 )
 from node_runtime.signals import EXIT_INTERRUPTED
-from policy_node.policies.files import to_csv, to_json, write_file
+from policy_node.policies.files import to_csv, to_json
 from policy_node.policies.policy import Policy
 from policy_node.training.evaluation import (
     FIRST_SEED,
@@ -40,6 +36,7 @@ from policy_node.training.policy_options import (
     make_chosen_simulation,
     policy_errors,
     require_writable,
+    write_result,
 )
 
 _NAME = 'fetch_hand_sim evaluate'
@@ -93,32 +90,17 @@ def _run(options: argparse.Namespace) -> int:
     if not simulation.disturbances.is_off:
         report['disturbances'] = simulation.disturbances.as_dict()
     try:
-        try:
-            _show(report, options.json)
-        finally:
-            # Also if the terminal was closed.
-            _write(report, outcomes, options)
-    except BrokenPipeError:
-        raise
-    except OSError as error:
-        raise CommandError(f'{error.filename or "output"}: {error.strerror}') from None
+        if options.json == _STDOUT:
+            print(to_json(report).decode(), end='', flush=True)
+        else:
+            print_table(report)
+    finally:
+        # Also if the terminal was closed.
+        if options.json not in (None, _STDOUT):
+            write_result(options.json, to_json(report))
+        if options.csv is not None:
+            write_result(options.csv, _to_csv(outcomes))
     return code
-
-
-def _show(report: dict[str, Any], json_file: Path | None) -> None:
-    """Print the summary as a table, or as JSON for `--json` without a file."""
-    if json_file == _STDOUT:
-        print(to_json(report).decode(), end='', flush=True)
-    else:
-        print_table(report)
-
-
-def _write(report: dict[str, Any], outcomes: EpisodeOutcomes, options: argparse.Namespace) -> None:
-    """Write the files of `--json` and `--csv`."""
-    if options.json not in (None, _STDOUT):
-        write_file(options.json, to_json(report))
-    if options.csv is not None:
-        write_file(options.csv, _to_csv(outcomes))
 
 
 def _evaluate(
@@ -143,11 +125,10 @@ def _evaluate(
 
 
 def _to_csv(outcomes: EpisodeOutcomes) -> bytes:
-    """Return a CSV file with a row per episode."""
+    """Return a CSV file with a row per episode; flags are 0 or 1."""
     names = EpisodeOutcomes.__slots__
-    columns = [np.asarray(getattr(outcomes, name)) for name in names]
-    integers = [c.astype(int) if c.dtype == np.bool_ else c for c in columns]
-    return to_csv(names, zip(*(column.tolist() for column in integers), strict=True))
+    columns = ((getattr(outcomes, name) * 1).tolist() for name in names)
+    return to_csv(names, zip(*columns, strict=True))
 
 
 if __name__ == '__main__':

@@ -18,13 +18,13 @@ from msgs_spec.parameters import LARGEST_SEED
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ, task_spec
 from node_runtime.command_line import (
     EXIT_SUCCESS,
-    CommandError,
     CommandParser,
     UsageError,
     run_command,
+    say,
     whole_number,
 )
-from policy_node.policies.files import to_json, write_file
+from policy_node.policies.files import to_json
 from policy_node.policies.policy import Policy
 from policy_node.training.evaluation import FIRST_SEED, wilson_interval
 from policy_node.training.policy_options import (
@@ -32,6 +32,7 @@ from policy_node.training.policy_options import (
     load_chosen_policy,
     policy_errors,
     require_writable,
+    write_result,
 )
 
 
@@ -108,17 +109,11 @@ def _run(options: argparse.Namespace) -> int:
         'interval_95': [lower, upper],
     }
     try:
-        print(
-            f'{spec.reference_id}: {result["success"]:.4f} ({lower:.4f} ... {upper:.4f})',
-            flush=True,
-        )
+        say(f'{spec.reference_id}: {result["success"]:.4f} ({lower:.4f} ... {upper:.4f})')
     finally:
         # Also if the terminal was closed.
         if options.json is not None:
-            try:
-                write_file(options.json, to_json({**report, 'reference': result}))
-            except OSError as error:
-                raise CommandError(str(error)) from None
+            write_result(options.json, to_json({**report, 'reference': result}))
     return EXIT_SUCCESS
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from fetch_hand_sim.simulation import Simulation
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ, REWARD_TYPES, SUCCESS_RULES, TASKS
 from node_runtime.command_line import CommandError, UsageError, whole_number
+from policy_node.policies.files import write_file
 from policy_node.policies.loading import POLICY_NAMES, load_policy
 from policy_node.policies.policy import LoadedPolicy, PolicyError
 
@@ -107,3 +108,15 @@ def require_writable(file: Path) -> None:
         raise UsageError(f'{file} cannot be written: it is a folder')
     if not os.access(file if file.exists() else file.parent, os.W_OK):
         raise UsageError(f'{file} cannot be written: it is read-only')
+
+
+def write_result(file: Path, data: bytes) -> None:
+    """Write a file of a command.
+
+    Raises:
+        CommandError: If it cannot be written.
+    """
+    try:
+        write_file(file, data)
+    except OSError as error:
+        raise CommandError(f'{file}: {error.strerror}') from None

@@ -12,11 +12,10 @@ from typing import Any
 
 import torch
 
-from node_runtime.command_line import CommandError, UsageError
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.flat import typed_fields
 from policy_node.training.configuration.recipes import recipe_config
-from policy_node.training.runs.run import Caller, Ending, OnCycle, resumed_config, train_run
+from policy_node.training.runs.run import Caller, OnCycle, resumed_config, train_run
 from policy_node.training.runs.run_folder import (
     BEST_FILE,
     LATEST_FILE,
@@ -110,10 +109,12 @@ def train(
         if (folder / STATE_FILE).is_file():
             raise ValueError(f'{folder} contains a run. Use resume=True or choose another folder')
     given: dict[str, Any] = {} if recipe is None else {'recipe': recipe}
-    given |= {'resume': True} if resume else {}
-    command = _command(task, folder, given | fields)
+    given |= ({'resume': True} if resume else {}) | fields
+    named = ''.join(f', {name}={value!r}' for name, value in given.items())
+    command = f'policy_node.training.train({task!r}, {str(folder)!r}{named})'
     with _torch_restored():
-        ending = _ending(config, folder, resume, command, Caller(on_cycle, quiet))
+        caller = Caller(on_cycle, quiet)
+        ending = train_run(config, folder, resume=resume, command=command, caller=caller)
     if ending.signal == signal.SIGINT:
         raise KeyboardInterrupt(ending.reason)
     if ending.signal:
@@ -122,24 +123,6 @@ def train(
     return Run(
         folder, config, ending.reason, counters.env_steps, counters.seconds, counters.best_success
     )
-
-
-def _command(task: str, folder: Path, given: dict[str, Any]) -> str:
-    """Return the call in one line, for the record."""
-    named = [f'{name}={value!r}' for name, value in given.items()]
-    return f'policy_node.training.train({", ".join([repr(task), repr(str(folder)), *named])})'
-
-
-def _ending(
-    config: TrainConfig, folder: Path, resume: bool, command: str, caller: Caller
-) -> Ending:
-    """Train; turn the errors of commands into those of Python."""
-    try:
-        return train_run(config, folder, resume=resume, command=command, caller=caller)
-    except UsageError as error:
-        raise ValueError(str(error)) from error
-    except CommandError as error:
-        raise RuntimeError(str(error)) from error
 
 
 @contextlib.contextmanager

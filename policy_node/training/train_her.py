@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from msgs_spec.tasks import TASKS, task_spec
 from node_runtime.command_line import (
     EXIT_SUCCESS,
+    CommandError,
     CommandParser,
     UsageError,
     complain,
@@ -100,16 +101,19 @@ def _run(options: argparse.Namespace, command: str) -> int:
     from policy_node.training.machine import is_first_worker
     from policy_node.training.runs.run import train_run
     from policy_node.training.runs.run_folder import default_folder
+    from policy_node.training.runs.training_state import TrainingError
 
     try:
         config = config_from_arguments(options)
         output = options.resume or options.output
         output = output or default_folder(config)
         experience = _read_experience(config, options.from_episodes)
-    except (ValueError, TypeError) as error:
+        resume = options.resume is not None
+        ending = train_run(config, output, resume=resume, command=command, experience=experience)
+    except ValueError as error:
         raise UsageError(str(error)) from None
-    resume = options.resume is not None
-    ending = train_run(config, output, resume=resume, command=command, experience=experience)
+    except TrainingError as error:
+        raise CommandError(str(error)) from None
     counters = ending.counters
     best = f'{counters.best_success:.3f}' if counters.best_success >= 0 else 'not evaluated'
     if is_first_worker():

@@ -31,11 +31,10 @@ from node_runtime.command_line import (
     say,
     whole_number,
 )
-from policy_node.policies.files import to_csv, to_json, write_file
+from policy_node.policies.files import to_csv, to_json
 from policy_node.policies.policy import LoadedPolicy
 from policy_node.training.evaluation import (
     FIRST_SEED,
-    EpisodeOutcomes,
     evaluate,
     wilson_interval,
 )
@@ -46,6 +45,7 @@ from policy_node.training.policy_options import (
     make_chosen_simulation,
     policy_errors,
     require_writable,
+    write_result,
 )
 from policy_node.training.robustness.figure import draw
 from policy_node.training.robustness.sweeps import Point, points, sentence
@@ -91,10 +91,10 @@ def _run(options: argparse.Namespace) -> int:
         _measure(result, options, simulation, loaded, files['json'])
     success = {key: point['success'] for key, point in result['points'].items()}
     result['sentence'] = sentence(task_spec(loaded.task), result['control_hz'], success)
-    write_file(files['json'], to_json(result))
-    write_file(files['csv'], _to_csv(result))
+    write_result(files['json'], to_json(result))
+    write_result(files['csv'], _to_csv(result))
     try:
-        write_file(files['png'], draw(result))
+        write_result(files['png'], draw(result))
     except ImportError:
         say(f'{files["png"]} needs matplotlib: pip install fetch_hand_sim[train]')
     say(result['sentence'])
@@ -130,36 +130,19 @@ def _start(
     return {**result, 'points': earlier_points}
 
 
-class _Evaluation:
-    """Evaluates points with simulations of its own."""
-
-    def __init__(
-        self, options: argparse.Namespace, simulation: Simulation, loaded: LoadedPolicy
-    ) -> None:
-        self._options = options
-        self._simulation = simulation
-        self._policy = replace(loaded, is_bounded=True)
-
-    def measure(self, point: Point) -> dict[str, Any]:
-        """Return the result of a point."""
-        self._simulation.disturbances = point.disturbances
-        episodes, first_seed = self._options.episodes, self._options.first_seed
-        return _measured(point, evaluate(self._simulation, self._policy, episodes, first_seed))
-
-
-# The evaluation of this process, if it is a worker.
-_worker: list[_Evaluation] = []
+# What a worker process evaluates with: options, simulation and policy.
+_worker: list[Any] = []
 
 
 def _start_worker(options: argparse.Namespace) -> None:
     # Ctrl-C ends the worker at once and without a traceback.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     loaded = load_chosen_policy(options)
-    _worker.append(_Evaluation(options, make_chosen_simulation(options, loaded), loaded))
+    _worker.extend((options, make_chosen_simulation(options, loaded), loaded))
 
 
 def _measure_in_worker(point: Point) -> dict[str, Any]:
-    return _worker[0].measure(point)
+    return _measured(*_worker, point)
 
 
 def _measured_in_workers(
@@ -188,22 +171,24 @@ def _measure(
 ) -> None:
     """Evaluate the points that are missing; write the file after each."""
     missing = [each for each in points(simulation.spec) if each.key not in result['points']]
-    found: Iterator[dict[str, Any]]
     if options.jobs > 1 and missing:
         found = _measured_in_workers(options, missing)
     else:
-        found = map(_Evaluation(options, simulation, loaded).measure, missing)
+        found = (_measured(options, simulation, loaded, point) for point in missing)
     with progress('points', len(missing)) as advance:
         for point, measured in zip(missing, found, strict=True):
             result['points'][point.key] = measured
-            try:
-                write_file(file, to_json(result))
-            except OSError as error:
-                raise CommandError(f'{file}: {error.strerror}') from None
+            write_result(file, to_json(result))
             advance(1)
 
 
-def _measured(point: Point, outcomes: EpisodeOutcomes) -> dict[str, Any]:
+def _measured(
+    options: argparse.Namespace, simulation: Simulation, loaded: LoadedPolicy, point: Point
+) -> dict[str, Any]:
+    """Return the result of a point."""
+    simulation.disturbances = point.disturbances
+    bounded = replace(loaded, is_bounded=True)
+    outcomes = evaluate(simulation, bounded, options.episodes, options.first_seed)
     count = int(outcomes.success_gymnasium.sum())
     return {
         'disturbance': point.name,
@@ -218,19 +203,9 @@ def _measured(point: Point, outcomes: EpisodeOutcomes) -> dict[str, Any]:
 
 def _to_csv(result: dict[str, Any]) -> bytes:
     """Return a CSV file with a row per point."""
-    columns = ['disturbance', 'level', 'success', 'low_95', 'high_95', 'dropped', 'diverged']
-    points = result['points'].values()
-    return to_csv(
-        columns,
-        (
-            [
-                each['disturbance'],
-                each['level'],
-                each['success'],
-                *each['success_interval_95'],
-                each['dropped'],
-                each['diverged'],
-            ]
-            for each in points
-        ),
+    before, after = ['disturbance', 'level', 'success'], ['dropped', 'diverged']
+    rows = (
+        [*(each[n] for n in before), *each['success_interval_95'], *(each[n] for n in after)]
+        for each in result['points'].values()
     )
+    return to_csv([*before, 'low_95', 'high_95', *after], rows)

@@ -1,17 +1,21 @@
-"""Networks that a run starts from instead of random ones, adapted to its configuration."""
+"""Networks that a run starts from instead of random ones: read and adapted to its configuration."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+import os
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from msgs_spec.tasks import task_spec
+from policy_node.policies import checkpoint
+from policy_node.policies.loading import actor_path
 from policy_node.policies.network_shape import NetworkShape
-from policy_node.training.configuration.config import TrainConfig
-from policy_node.training.configuration.flat import to_flat
+from policy_node.training.configuration.config import TrainConfig, unusual_networks
+from policy_node.training.configuration.flat import config_from_dict
 from policy_node.training.learners.actor_critic import ActorCritic, first_weights, with_inputs
 from policy_node.training.research.registry import (
     Ensemble,
@@ -20,16 +24,22 @@ from policy_node.training.research.registry import (
     critic_tensors,
     is_ensemble,
     network_shape,
+    without_input,
 )
-from policy_node.training.runs.training_state import part_of
+from policy_node.training.runs.run_folder import STATE_FILE, companion_file
+from policy_node.training.runs.training_state import TrainingState, part_of, read_state
 
 # Updates of the critics alone if a random critic starts beside a trained actor: the gradient of an
 # untrained critic would ruin the actor.
 CRITIC_FIRST = 5_000
-# If these differ, the values of a critic have another meaning: dense rewards are distances, and
-# discounts are per tick.
-VALUED_BY = ('reward_type', 'control_hz')
-# Parts of a training state that are critics.
+# If these differ, a critic has other layers, or its values another meaning: dense rewards are
+# distances, and discounts are per tick.
+_CRITIC_FIELDS = ('norm', 'reward_type', 'control_hz')
+# Fields that must agree between an actor and the critic beside it.
+_SHARED = ('task', 'hidden_sizes', 'layer_norm', 'goal_features')
+# Parts of a training state to start from; optimisers start fresh.
+_PARTS = ('actor', 'critic', 'target_', 'average_actor', 'observation_stat', 'goal_stat')
+# Parts that are critics.
 _CRITICS = ('critic', 'target_critic')
 _PREFIXES = tuple(f'{part}.' for part in _CRITICS)
 
@@ -41,20 +51,19 @@ class InitialNetworks:
     Attributes:
         tensors: Named as in a training state, without optimisers and generators.
         origin: Name, task, environment steps and command of their training, for the record.
-        valued_by: Fields of the run that give the values of its critic a meaning (`VALUED_BY`).
+        critic_config: Configuration with which the critic was trained; None without a critic.
     """
 
     tensors: dict[str, Tensor]
     shape: NetworkShape
     goal_features: str
-    norm: str
     origin: dict[str, Any]
-    valued_by: dict[str, Any] = field(default_factory=dict)
+    critic_config: TrainConfig | None
 
     @property
-    def has_critic(self) -> bool:
-        """True if they contain a critic."""
-        return any(name.startswith('critic.') for name in self.tensors)
+    def critics(self) -> int:
+        """Number of critics."""
+        return count_critics(part_of(self.tensors, 'critic'))
 
     def require_fit(self, config: TrainConfig) -> None:
         """Raise ValueError if a run with this configuration cannot start from these networks."""
@@ -95,10 +104,10 @@ class InitialNetworks:
         if acting_input(config) is not None:
             tensors = with_inputs(fitted.tensors, shape.feature_size, 1)
             fitted = replace(fitted, tensors=tensors)
-        values = {name: to_flat(config)[name] for name in self.valued_by}
-        if config.norm != self.norm or values != self.valued_by:
-            return fitted.without_critic()
-        return fitted.with_critics(config.critics)
+        critic = self.critic_config
+        if critic and all(getattr(critic, n) == getattr(config, n) for n in _CRITIC_FIELDS):
+            return fitted._with_critics(config.critics)
+        return fitted._with_critics(0)
 
     def _shape_in(self, config: TrainConfig) -> NetworkShape:
         """Return the shape with the past actions of a run, or with their own if they have some."""
@@ -127,23 +136,17 @@ class InitialNetworks:
                 tensors[name] = torch.cat([tensor, more])
         return replace(self, tensors=tensors, shape=shape)
 
-    def without_critic(self) -> InitialNetworks:
-        """Return only the actor and its normalisers."""
-        tensors = {n: v for n, v in self.tensors.items() if not n.startswith(_PREFIXES)}
-        return replace(self, tensors=tensors, origin=self.origin | {'critic': False})
-
-    @property
-    def critics(self) -> int:
-        """Number of critics."""
-        return count_critics(part_of(self.tensors, 'critic'))
-
-    def with_critics(self, critics: int) -> InitialNetworks:
+    def _with_critics(self, critics: int) -> InitialNetworks:
         """Return these networks with tensor names for `critics` critics; some may be missing."""
-        if critics == 1 == self.critics and not is_ensemble(part_of(self.tensors, 'critic')):
+        given = {part: part_of(self.tensors, part) for part in _CRITICS}
+        if critics == 1 == self.critics and not is_ensemble(given['critic']):
             return self
         tensors = {n: v for n, v in self.tensors.items() if not n.startswith(_PREFIXES)}
-        for part in _CRITICS:
-            named = critic_tensors(part_of(self.tensors, part), critics)
+        if not critics:
+            origin = self.origin | {'critic': False}
+            return replace(self, tensors=tensors, origin=origin, critic_config=None)
+        for part, values in given.items():
+            named = critic_tensors(values, critics)
             tensors |= {f'{part}.{name}': value for name, value in named.items()}
         known = {'critics': min(critics, self.critics)}
         return replace(self, tensors=tensors, origin=self.origin | known)
@@ -171,3 +174,128 @@ def _described(shape: NetworkShape, goal_features: str) -> dict[str, object]:
         'past_actions': shape.past_actions,
         'inputs': shape.feature_size,
     }
+
+
+def read_initial_networks(name: str) -> InitialNetworks:
+    """Read the networks called `name`.
+
+    Args:
+        name: A run folder, for its latest networks; a shipped actor; or the file of an actor. The
+            critic of an actor is in `<Task>.training.safetensors` beside it, or in the training
+            state of its run folder.
+
+    Raises:
+        ValueError: If the actor or run is missing or damaged.
+    """
+    path = Path(os.path.expanduser(name))
+    return _of_run(path) if path.is_dir() else _of_actor(name, actor_path(name))
+
+
+def _of_run(folder: Path) -> InitialNetworks:
+    state, config = _read_usual(folder / STATE_FILE, folder)
+    tensors = {
+        key: value
+        for key, value in state.tensors.items()
+        if key.startswith(_PARTS) and '_optimizer.' not in key
+    }
+    origin = {
+        'name': str(folder),
+        'task': config.task,
+        'env_steps': state.counters.env_steps,
+        'command': state.extra.get('command', ''),
+        'init_from': state.extra.get('init_from', {}),
+    }
+    tensors, shape = _unconditioned(tensors, config), network_shape(config)
+    return InitialNetworks(tensors, shape, config.goal_features, origin, config)
+
+
+def _of_actor(name: str, path: Path) -> InitialNetworks:
+    actor, info = checkpoint.load(path)
+    tensors = {f'actor.{key}': value for key, value in actor.state_dict().items()}
+    # A mean of several has few steps of its own.
+    seen = steps_behind({'env_steps': info.env_steps, 'init_from': info.init_from})
+    for part in ('observation', 'goal'):
+        mean, std = (tensors[f'actor.{part}_normalizer.{key}'] for key in ('mean', 'std'))
+        for key, value in _sums(mean, std, seen).items():
+            tensors[f'{part}_statistics.{key}'] = value
+    beside = (companion_file(path), path.parent / STATE_FILE)
+    source = next((file for file in beside if file.is_file()), None)
+    digest, config = checkpoint.checkpoint_hash(path), None
+    if source is not None:
+        state, config = _read_usual(source, source)
+        pairs = {each: (getattr(config, each), getattr(info, each)) for each in _SHARED}
+        differing = [
+            f'{n} {ours}, not {theirs}' for n, (ours, theirs) in pairs.items() if ours != theirs
+        ]
+        if differing or state.extra.get('actor_sha256', digest) != digest:
+            reason = f': {"; ".join(differing)}' if differing else ''
+            raise ValueError(f'{source} is the critic of another actor than {path}{reason}')
+        critic = _unconditioned(part_of(state.tensors, 'critic'), config)
+        tensors |= {f'critic.{key}': value for key, value in critic.items()}
+    origin = {
+        'name': name,
+        'critic': source is not None,
+        'task': info.task,
+        'env_steps': info.env_steps,
+        'command': info.command,
+        'sha256': digest,
+        'init_from': info.init_from,
+    }
+    return InitialNetworks(tensors, info.shape, info.goal_features, origin, config)
+
+
+def _read_usual(file: Path, source: Path) -> tuple[TrainingState, TrainConfig]:
+    """Read a training state; raise ValueError if no other run can start from its networks."""
+    state = read_state(file)
+    config = config_from_dict(state.extra['config'])
+    if found := unusual_networks(config):
+        raise ValueError(f'a run cannot start from {source}: {", ".join(found)}')
+    return state, config
+
+
+def _unconditioned(tensors: dict[str, Tensor], config: TrainConfig) -> dict[str, Tensor]:
+    """Return networks without their condition input, fixed at its value for acting."""
+    value = acting_input(config)
+    if value is None:
+        return tensors
+    return without_input(tensors, network_shape(config).feature_size, value)
+
+
+def _sums(mean: Tensor, std: Tensor, count: int) -> dict[str, Tensor]:
+    """Return the sums of `RunningStatistics` after `count` inputs of this mean and deviation."""
+    number = torch.tensor([float(max(count, 1))], dtype=torch.float64)
+    mean, std = mean.double(), std.double()
+    square = (std.square() + mean.square()) * number
+    return {'count': number, 'total': mean * number, 'total_square': square}
+
+
+def steps_behind(run: dict[str, Any]) -> int:
+    """Return the environment steps of an actor and of all networks that it started from.
+
+    Each run counts once, with its latest actor.
+
+    Args:
+        run: `env_steps` and `init_from`, as in the JSON file of an actor.
+    """
+    counted: dict[object, int] = {}
+    waiting = [run]
+    while waiting:
+        part = waiting.pop()
+        steps = int(part['env_steps'])
+        key = _run_of(part, steps)
+        counted[key] = max(counted.get(key, 0), steps)
+        waiting += [part['init_from']] if part.get('init_from') else []
+        waiting += part.get('mean_of', [])
+    return sum(counted.values())
+
+
+def _run_of(part: dict[str, Any], steps: int) -> object:
+    """Return a key that all actors of a run share: its folder, if one is named."""
+    name = part.get('name', '')
+    if name and ',' not in name:
+        if name.endswith('.safetensors'):
+            return str(Path(name).parent)
+        # The name of a run folder; only actors have a hash.
+        if 'sha256' not in part:
+            return str(Path(name))
+    return (part.get('sha256') or name, steps)

@@ -15,11 +15,8 @@ import numpy as np
 
 from msgs_spec.text import one_line
 from node_runtime.command_line import (
-    CommandError,
-    UsageError,
     complain,
     complain_from_handler,
-    require_extra,
 )
 from node_runtime.signals import on_stop_signals
 from node_runtime.source_revision import source_revision
@@ -35,8 +32,7 @@ from policy_node.training.machine import (
     why_too_large,
 )
 from policy_node.training.runs.imitation import ImitationTrainer
-from policy_node.training.runs.initial_networks import InitialNetworks
-from policy_node.training.runs.read_networks import read_initial_networks
+from policy_node.training.runs.initial_networks import InitialNetworks, read_initial_networks
 from policy_node.training.runs.run_folder import (
     COMMAND_FILE,
     CURVE_FILE,
@@ -75,7 +71,7 @@ class Caller:
     error: Exception | None = field(default=None, init=False)
 
 
-class RunTakenError(CommandError):
+class RunTakenError(TrainingError):
     """Another process trains in the folder."""
 
 
@@ -133,27 +129,25 @@ def train_run(
         caller: The calling Python program; None for a command.
 
     Raises:
-        UsageError: If a requirement is missing or does not fit. Only the folder and its lock are
+        ValueError: If a requirement is missing or does not fit. Only the folder and its lock are
             written.
         RunTakenError: If another process trains in the folder.
-        CommandError: If training fails; the last checkpoint stays.
+        TrainingError: If training fails; the last checkpoint stays.
     """
-    require_extra('train')
     networks = _initial_networks(config) if config.init_from and not resume else None
     with lock_run(output) if is_first_worker() else contextlib.nullcontext():
         if not resume and (output / STATE_FILE).exists():
-            raise UsageError(f'{output} contains a run. Use --resume or choose another folder')
+            raise ValueError(f'{output} contains a run. Use --resume or choose another folder')
         trainer = _make_trainer(config, output, command, networks, resume, experience)
         if isinstance(trainer, Trainer) and (why := _too_large(trainer)):
             complain(NAME, why)
         try:
             ending = _train(trainer, output, command, caller, resume=resume)
         except (TrainingError, OSError) as error:
+            is_kept = (output / STATE_FILE).is_file()
             kept = f'the last checkpoint is in {output}'
-            none = f'{output} contains no checkpoint'
-            raise CommandError(
-                f'{error}; {kept if (output / STATE_FILE).is_file() else none}'
-            ) from None
+            note = kept if is_kept else f'{output} contains no checkpoint'
+            raise TrainingError(f'{error}; {note}') from None
         finally:
             leave_workers(trainer.workers)
         if caller is not None and caller.error is not None:
@@ -168,11 +162,8 @@ def train_run(
 
 
 def _initial_networks(config: TrainConfig) -> InitialNetworks:
-    try:
-        networks = read_initial_networks(config.init_from).fitted(config)
-    except ValueError as error:
-        raise UsageError(str(error)) from None
-    if not networks.has_critic and config.algorithm != 'imitation':
+    networks = read_initial_networks(config.init_from).fitted(config)
+    if not networks.critics and config.algorithm != 'imitation':
         complain(NAME, f'{config.init_from} has no critic for this run; a new one learns first')
     return networks
 
@@ -188,7 +179,7 @@ def _make_trainer(
     """Return the trainer with its start state and logged episodes.
 
     Raises:
-        UsageError: If something does not fit the configuration or the memory of the machine.
+        ValueError: If something does not fit the configuration or the memory of the machine.
     """
     try:
         workers = join_workers(choose_device(config.device))
@@ -200,14 +191,12 @@ def _make_trainer(
             trainer.resume(output / STATE_FILE)
         if experience is not None:
             trainer.add_experience(experience)
-    except ValueError as error:
-        raise UsageError(str(error)) from None
     except (MemoryError, RuntimeError) as error:
         # torch has no class for this error.
         if isinstance(error, RuntimeError) and 'allocate' not in str(error):
             raise
         fields = 'replay_transitions, num_envs or hidden_sizes'
-        raise UsageError(f'not enough memory; use smaller {fields}: {one_line(error)}') from None
+        raise ValueError(f'not enough memory; use smaller {fields}: {one_line(error)}') from None
     return trainer
 
 
@@ -281,14 +270,14 @@ def lock_run(folder: Path) -> Iterator[None]:
     The lock ends with the process. Some file systems of clusters have no locks; then a line warns.
 
     Raises:
-        UsageError: If the folder cannot be created or written.
+        ValueError: If the folder cannot be created or written.
         RunTakenError: If another process trains in it.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
         lock = (folder / LOCK_FILE).open('w')
     except OSError as error:
-        raise UsageError(f'{folder} cannot hold a run: {error.strerror}') from None
+        raise ValueError(f'{folder} cannot hold a run: {error.strerror}') from None
     with lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from msgs_spec.tasks import TASKS
-from policy_node.training.runs.read_networks import steps_behind
+from policy_node.training.runs.initial_networks import steps_behind
 
 EXACT = 'exact'
 """Read from a text, log, table or configuration file of the source."""

@@ -26,6 +26,7 @@ from node_runtime.command_line import (
 from node_runtime.signals import discard_unread_output, end_with_parent
 from policy_node.training.configuration.flat import changed
 from policy_node.training.runs.run import RunTakenError, lock_run, train_run
+from policy_node.training.runs.training_state import TrainingError
 from policy_node.training.studies.measures import measure_run
 from policy_node.training.studies.store import add_run, holds, read_runs
 from policy_node.training.studies.study import Job
@@ -153,7 +154,7 @@ def attempt(job: Job, report: Path, command: str) -> Outcome:
     except RunTakenError:
         _print(f'{job.name} is being trained by another process')
         return Outcome.TAKEN
-    except (CommandError, OSError, ValueError) as error:
+    except (CommandError, TrainingError, OSError, ValueError) as error:
         complain('fetch_hand_sim benchmark', f'{job.name}: {error}')
         return Outcome.FAILED
     except Exception:

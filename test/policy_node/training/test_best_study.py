@@ -18,7 +18,7 @@ from msgs_spec.tasks import TASKS
 from policy_node.policies import checkpoint
 from policy_node.training.configuration.flat import to_flat
 from policy_node.training.configuration.recipes import recipe_config
-from policy_node.training.runs.read_networks import steps_behind
+from policy_node.training.runs.initial_networks import steps_behind
 from policy_node.training.runs.run_log import read_progress
 from policy_node.training.runs.training_state import Counters, TrainingState, state_bytes
 from policy_node.training.studies.best import BEST_ORDER, STARTS_FROM, start_from

@@ -19,7 +19,7 @@ from policy_node.policies.loading import shipped_actors
 from policy_node.training.configuration.recipes import recipe_config
 from policy_node.training.machine import Workers, available_memory
 from policy_node.training.runs import run as run_module
-from policy_node.training.runs.read_networks import read_initial_networks
+from policy_node.training.runs.initial_networks import read_initial_networks
 from policy_node.training.runs.run_log import read_progress
 from policy_node.training.runs.trainer import Trainer
 from policy_node.training.runs.training_state import read_counters

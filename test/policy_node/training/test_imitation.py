@@ -14,7 +14,7 @@ from policy_node.policies.loading import load_actor
 from policy_node.training.configuration.recipes import recipe_config
 from policy_node.training.machine import Workers
 from policy_node.training.runs.imitation import Answers, ImitationTrainer
-from policy_node.training.runs.read_networks import read_initial_networks
+from policy_node.training.runs.initial_networks import read_initial_networks
 from policy_node.training.runs.run_log import read_progress
 from policy_node.training.train_her import main
 

@@ -19,7 +19,7 @@ from policy_node.training.configuration.recipes import recipe_config
 from policy_node.training.machine import Workers
 from policy_node.training.research.registry import network_shape
 from policy_node.training.runs.initial_networks import CRITIC_FIRST
-from policy_node.training.runs.read_networks import read_initial_networks, steps_behind
+from policy_node.training.runs.initial_networks import read_initial_networks, steps_behind
 from policy_node.training.runs.run_folder import STATE_FILE
 from policy_node.training.runs.run_log import read_progress
 from policy_node.training.runs.trainer import Trainer
@@ -168,14 +168,14 @@ def test_a_critic_with_another_norm_starts_from_random_weights(
     task, run = 'HandManipulateBlockRotateXYZ', tmp_path / 'run'
     config = tiny(task, norm='layer')
     networks = read_initial_networks(str(block_run)).fitted(config)
-    assert not networks.has_critic
+    assert not networks.critics
     started = Trainer(config, tmp_path, Workers(), init_from=networks).learner
     assert started.critic_first == CRITIC_FIRST
     assert same(started.actor.state_dict(), part_of(networks.tensors, 'actor'))
     arguments = ['--task', task, '--steps', '200', *SET, '--set=norm=layer']
     assert main([*arguments, '--init-from', str(block_run), '--output', str(run)]) == 0
     on = read_initial_networks(str(run))
-    assert on.fitted(config).has_critic and not on.fitted(tiny(task)).has_critic
+    assert on.fitted(config).critics and not on.fitted(tiny(task)).has_critic
 
 
 def test_without_targets_a_run_starts_from_the_networks_themselves(
@@ -229,7 +229,7 @@ def test_the_origin_is_kept_in_resumed_and_shipped_actors(tmp_path: Path, block_
     report = json.loads((actors / 'HandManipulateBlockFull.json').read_text())
     assert report['init_from'] == origin
     shipped = read_initial_networks(str(actors / 'HandManipulateBlockFull.safetensors'))
-    assert shipped.has_critic
+    assert shipped.critics
     latest = read_initial_networks(str(run))
     critic = {name for name in latest.tensors if name.startswith('critic.')}
     assert all(torch.equal(shipped.tensors[name], latest.tensors[name]) for name in critic)
@@ -350,7 +350,7 @@ def test_finetune_starts_from_the_shipped_networks(task: str) -> None:
     config = recipe_config(task, 'finetune')
     networks = read_initial_networks(config.init_from)
     networks.require_fit(config)
-    assert networks.origin['task'] == task and networks.has_critic
+    assert networks.origin['task'] == task and networks.critics
     assert networks.fitted(config).shape == network_shape(config)
 
 
@@ -365,10 +365,10 @@ def test_a_critic_of_other_rewards_is_left_out(
 ) -> None:
     task = 'HandManipulateBlockRotateXYZ'
     networks = read_initial_networks(str(block_run))
-    assert networks.fitted(tiny(task)).has_critic
+    assert networks.fitted(tiny(task)).critics
     config = tiny(task, **changes)
     fitted = networks.fitted(config)
-    assert not fitted.has_critic
+    assert not fitted.critics
     started = Trainer(config, tmp_path, Workers(), init_from=fitted)
     assert started.learner.critic_first == CRITIC_FIRST
     actor = started.learner.actor.state_dict()
