@@ -215,15 +215,11 @@ class Evaluator:
     """Evaluates on the same episodes each time, in simulations of its own.
 
     Training episodes therefore do not depend on whether there was an evaluation between them.
-
-    Attributes:
-        others: Policies to evaluate beside the actor, by column of `progress.csv`.
     """
 
     def __init__(self, simulation: Simulation, config: TrainConfig) -> None:
         self._simulation = simulation
         self._config = config
-        self.others: dict[str, Policy] = {}
 
     def evaluate(self, actor: Actor, best_success: float) -> EpisodeOutcomes:
         """Runs the episodes, fewer once their success cannot reach `best_success` any more.
@@ -239,18 +235,11 @@ class Evaluator:
         episodes = self._config.evaluation_episodes
         return evaluate(self._simulation, actor, episodes, EVALUATION_SEED, hopeless)
 
-    def evaluate_others(self) -> dict[str, float]:
-        """Return the success rates of the other policies in all episodes, by column."""
-        episodes, rule = self._config.evaluation_episodes, self._config.success_rule
-        found = {}
-        for column, policy in self.others.items():
-            outcomes = evaluate(self._simulation, policy, episodes, EVALUATION_SEED)
-            found[column] = success_rate(outcomes, rule)
-        return found
-
-    def is_complete(self, outcomes: EpisodeOutcomes) -> bool:
-        """Return whether an evaluation ran all its episodes, so that it may select the best."""
-        return len(outcomes) >= self._config.evaluation_episodes
+    def success_of(self, policy: Policy) -> float:
+        """Return the success rate of a policy in all episodes."""
+        episodes = self._config.evaluation_episodes
+        outcomes = evaluate(self._simulation, policy, episodes, EVALUATION_SEED)
+        return success_rate(outcomes, self._config.success_rule)
 
 
 def successes(outcomes: EpisodeOutcomes, success_rule: str) -> NDArray[np.bool_]:

@@ -66,7 +66,7 @@ def measure(run: Path, episodes: int) -> list[Comparison]:
         sampler,
         np.random.default_rng(0),
     )
-    load_state(run / STATE_FILE, learner, experience.statistics)
+    load_state(run / STATE_FILE, learner, {**learner.modules(), **experience.statistics})
     values, rewards = _play(simulation, learner, sampler.at(progress).compute_reward)
     returns = discounted(rewards * sampler.reward_scale, config.tick_gamma)
     ticks = [int(share * len(values)) for share in _SHARES]

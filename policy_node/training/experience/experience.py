@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
-from torch import Tensor
+from torch import Tensor, nn
 
 from fetch_hand_sim.simulation.tasks.hand_manipulate import PALM_HEIGHT
 from msgs_spec.tasks import GoalKind, TaskSpec
@@ -29,13 +29,17 @@ from policy_node.training.machine import Workers
 SMALLEST_STD = 0.01
 
 
-class RunningStatistics:
+class RunningStatistics(nn.Module):
     """Sums over all inputs; `write` sets the mean and deviation of a `Normalizer` from them."""
 
+    count: Tensor
+    total: Tensor
+    total_square: Tensor
+
     def __init__(self, size: int) -> None:
-        self.count = torch.zeros(1, dtype=torch.float64)
-        self.total = torch.zeros(size, dtype=torch.float64)
-        self.total_square = torch.zeros(size, dtype=torch.float64)
+        super().__init__()
+        for name, length in (('count', 1), ('total', size), ('total_square', size)):
+            self.register_buffer(name, torch.zeros(length, dtype=torch.float64))
 
     def update(self, values: ArrayLike, workers: Workers) -> None:
         """Add the rows of `values` (..., size) of all workers, clipped as inputs of networks are.
@@ -59,25 +63,6 @@ class RunningStatistics:
         variance = self.total_square / self.count - mean.square()
         normalizer.mean.copy_(mean)
         normalizer.std.copy_(variance.clamp(min=SMALLEST_STD**2).sqrt())
-
-    def state(self) -> dict[str, Tensor]:
-        """Return the sums, for a checkpoint."""
-        return {'count': self.count, 'total': self.total, 'total_square': self.total_square}
-
-    def load_state(self, state: dict[str, Tensor]) -> None:
-        """Continue from sums that `state` returned.
-
-        Raises:
-            KeyError: If one is missing.
-            ValueError: If one has another size.
-        """
-        for name, value in self.state().items():
-            given = state[name]
-            if given.shape != value.shape:
-                raise ValueError(
-                    f'{name} of inputs is {tuple(given.shape)}, not {tuple(value.shape)}'
-                )
-            value.copy_(given)
 
 
 class Experience:

@@ -142,7 +142,8 @@ def _start_worker(options: argparse.Namespace) -> None:
 
 
 def _measure_in_worker(point: Point) -> dict[str, Any]:
-    return _measured(*_worker, point)
+    options, simulation, loaded = _worker
+    return _measured(options, simulation, loaded, point)
 
 
 def _measured_in_workers(

@@ -22,14 +22,15 @@ from msgs_spec.disturbances import read_disturbances
 from policy_node.policies.actor import Actor
 from policy_node.policies.policy import past_after
 from policy_node.training.configuration.config import TrainConfig
-from policy_node.training.evaluation import EpisodeOutcomes, Evaluator, training_seeds
+from policy_node.training.evaluation import EpisodeOutcomes, training_seeds
 from policy_node.training.learners.ddpg import Critic
-from policy_node.training.machine import Workers, split_threads
-from policy_node.training.research.registry import make_simulation, network_shape
+from policy_node.training.machine import Workers
+from policy_node.training.research.registry import network_shape
 from policy_node.training.runs.initial_networks import InitialNetworks
-from policy_node.training.runs.run_folder import LATEST_FILE, RunFolder
-from policy_node.training.runs.run_log import RunLog, progress_row
-from policy_node.training.runs.training_state import Counters, RunClock, ended_by, part_of
+from policy_node.training.runs.run_folder import LATEST_FILE
+from policy_node.training.runs.run_log import RunLog, loss_columns
+from policy_node.training.runs.trainer import BaseTrainer
+from policy_node.training.runs.training_state import RunClock, part_of
 
 
 class Answers:
@@ -63,7 +64,7 @@ def _scaled(config: TrainConfig, scale: float) -> TrainConfig:
     return replace(config, disturbances=json.dumps(scaled.as_dict()))
 
 
-class ImitationTrainer:
+class ImitationTrainer(BaseTrainer):
     """One run of imitation.
 
     Args:
@@ -89,18 +90,11 @@ class ImitationTrainer:
     ) -> None:
         if workers.world_size > 1:
             raise ValueError(f'{workers.world_size} workers; algorithm imitation needs 1')
-        self.config, self.workers, self.counters = config, workers, Counters()
-        origin = init_from.origin
-        self._folder = RunFolder(output, config, workers, command, source_revision, origin)
-        threads, torch_threads = split_threads(config)
-        torch.set_num_threads(torch_threads)
-        torch.manual_seed(config.seed)
+        super().__init__(config, output, workers, command, source_revision, init_from.origin)
         self._simulations = [
-            make_simulation(_scaled(config, scale), config.num_envs, threads)
+            self._simulate(_scaled(config, scale), config.num_envs)
             for scale in config.disturbance_scales
         ]
-        count = min(config.num_envs, config.evaluation_episodes)
-        self._evaluator = Evaluator(make_simulation(config, count, threads), config)
         self.actor = Actor(network_shape(config))
         self.actor.load_state_dict(part_of(init_from.tensors, 'actor'))
         # The past actions, which the imitated policy does not have, have zero weights here.
@@ -112,7 +106,6 @@ class ImitationTrainer:
         if self._critic is not None:
             sizes.append(shape.feature_size)
         self._answers = Answers(min(capacity, config.total_steps), sizes)
-        self._stop_reason = ''
 
     def _make_critic(self, init_from: InitialNetworks) -> Critic | None:
         if not self.config.value_weight:
@@ -127,10 +120,6 @@ class ImitationTrainer:
                 f'value_weight {self.config.value_weight}: {name} has no single critic beside it'
             ) from None
         return critic.requires_grad_(False)
-
-    def stop(self, reason: str) -> None:
-        """Request the end of the run after the current cycle."""
-        self._stop_reason = reason
 
     def train(self, log: RunLog | None = None) -> str:
         """Run until a limit is reached or `stop` is called; return why it ended.
@@ -149,14 +138,10 @@ class ImitationTrainer:
             reason = reason or self._reason_to_stop()
             if outcomes is not None or reason:
                 self._folder.save_actor(LATEST_FILE, self.actor, counters.env_steps)
-            row = progress_row(counters, success, outcomes, config.success_rule, [])
+            samples = config.updates_per_cycle * config.batch_size
             seconds = max(time.monotonic() - before, 1e-9)
-            ticks = self._simulations[0].spec.episode_ticks
-            row |= {
-                'actor_loss': loss,
-                'steps_per_second': config.num_envs * ticks / seconds,
-                'samples_per_second': config.updates_per_cycle * config.batch_size / seconds,
-            }
+            row = self._row(success, outcomes, samples, seconds)
+            row |= {**loss_columns([]), 'actor_loss': loss}
             if log is not None:
                 log.write(row)
             if reason:
@@ -232,7 +217,3 @@ class ImitationTrainer:
         outcomes = self._evaluator.evaluate(self.actor, -1.0)
         self._folder.keep_best(outcomes, self.actor, counters)
         return outcomes
-
-    def _reason_to_stop(self) -> str:
-        _, ended = ended_by(self.config, self.counters) or ('', '')
-        return self._stop_reason or ended

@@ -151,7 +151,6 @@ def progress_row(
     train_success: float,
     outcomes: EpisodeOutcomes | None,
     success_rule: str,
-    losses: Sequence[Losses],
 ) -> Row:
     """Return the values of a cycle by column; `outcomes` are those of its evaluation, if any."""
     row: Row = {
@@ -162,9 +161,6 @@ def progress_row(
         'train_success': train_success,
         'processor_seconds': counters.processor_seconds,
     }
-    for name, column in _LOSS_COLUMNS.items():
-        values = [getattr(loss, name) for loss in losses]
-        row[column] = float(torch.stack(values).mean()) if values else None
     if outcomes is not None:
         row['eval_success'] = success_rate(outcomes, success_rule)
         row['eval_episodes'] = len(outcomes)
@@ -172,6 +168,15 @@ def progress_row(
         found = diagnose(outcomes)
         row |= {f'eval_{name}': found[name] for name in found if name != 'long_way_share'}
     return row
+
+
+def loss_columns(losses: Sequence[Losses]) -> Row:
+    """Return the means of the losses of a cycle by column."""
+    found: Row = {}
+    for name, column in _LOSS_COLUMNS.items():
+        values = [getattr(loss, name) for loss in losses]
+        found[column] = float(torch.stack(values).mean()) if values else None
+    return found
 
 
 def _short(value: float | None) -> str:

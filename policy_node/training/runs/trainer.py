@@ -8,7 +8,7 @@ learn (`learner.update`), evaluate (`evaluator.evaluate`) and keep the best acto
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -17,7 +17,10 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import nn
 
+from fetch_hand_sim.simulation import Simulation
+from msgs_spec.tasks import task_spec
 from node_runtime.command_line import complain
 from policy_node.policies.actor import Actor
 from policy_node.policies.policy import Policy
@@ -35,7 +38,7 @@ from policy_node.training.research.registry import (
 )
 from policy_node.training.runs.initial_networks import CRITIC_FIRST, InitialNetworks
 from policy_node.training.runs.run_folder import NAME, RunFolder
-from policy_node.training.runs.run_log import RunLog, progress_row
+from policy_node.training.runs.run_log import Row, RunLog, loss_columns, progress_row
 from policy_node.training.runs.training_state import (
     Counters,
     RunClock,
@@ -49,7 +52,8 @@ from policy_node.training.runs.training_state import (
     require_readable,
 )
 
-Submit = Callable[..., 'Future[Collected]']
+Candidate = tuple[Actor, dict[str, Policy]]
+"""An actor to evaluate, and policies beside it by column of `progress.csv`."""
 
 # Largest number of steps that a resumed run without its replay collects before it learns.
 MOST_REFILLED = 100_000
@@ -66,7 +70,57 @@ class Collected:
     others: dict[str, float] = field(default_factory=dict)
 
 
-class Trainer:
+class BaseTrainer:
+    """What every run has: simulations, folder, counters and an end.
+
+    Args:
+        origin: Origin of the first networks; empty if they are random.
+    """
+
+    def __init__(
+        self,
+        config: TrainConfig,
+        output: Path,
+        workers: Workers,
+        command: str,
+        source_revision: str,
+        origin: dict[str, Any],
+    ) -> None:
+        self.config, self.workers, self.counters = config, workers, Counters()
+        self._folder = RunFolder(output, config, workers, command, source_revision, origin)
+        self._threads, torch_threads = split_threads(config)
+        torch.set_num_threads(torch_threads)
+        torch.manual_seed(config.seed)
+        count = min(workers.share(config.num_envs), config.evaluation_episodes)
+        self._evaluator = Evaluator(self._simulate(config, count), config)
+        self.spec = task_spec(config.task, control_hz=config.control_hz)
+        self._stop_reason = ''
+
+    def _simulate(self, config: TrainConfig, count: int) -> Simulation:
+        return make_simulation(config, count, self._threads)
+
+    def stop(self, reason: str) -> None:
+        """End the run after the current cycle, with a checkpoint."""
+        self._stop_reason = reason
+
+    def _reason_to_stop(self) -> str:
+        _, ended = ended_by(self.config, self.counters) or ('', '')
+        reason = self._stop_reason or ended
+        return (reason or 'another worker stopped') if self.workers.any(bool(reason)) else ''
+
+    def _row(
+        self, train_success: float, outcomes: EpisodeOutcomes | None, samples: int, seconds: float
+    ) -> Row:
+        """Return the row of a cycle that took so many seconds and learnt from so many samples."""
+        row = progress_row(self.counters, train_success, outcomes, self.config.success_rule)
+        workers = self.workers
+        steps = workers.share(self.config.num_envs) * self.spec.episode_ticks * workers.world_size
+        row['steps_per_second'] = steps / seconds
+        row['samples_per_second'] = samples / seconds
+        return row
+
+
+class Trainer(BaseTrainer):
     """One run of one configuration, on one of several workers.
 
     Args:
@@ -82,34 +136,27 @@ class Trainer:
         source_revision: str = '',
         init_from: InitialNetworks | None = None,
     ) -> None:
-        self.config = config
-        self.workers = workers
         origin = {} if init_from is None else init_from.origin
-        self._folder = RunFolder(output, config, workers, command, source_revision, origin)
-        self.device = choose_device(config.device)
-        self._simulation_threads, torch_threads = split_threads(config)
-        torch.set_num_threads(torch_threads)
-        torch.manual_seed(config.seed)
-        self._build_simulations()
-        self._build_learner()
+        super().__init__(config, output, workers, command, source_revision, origin)
+        self.simulation = self._simulate(config, workers.share(config.num_envs))
+        sampler = make_sampler(config, self.simulation.metric)
+        device, generator = choose_device(config.device), self._seed(env_steps=0)
+        self.learner, self.experience = make_learner(
+            config, self.spec, device, workers, sampler, generator
+        )
+        require_readable(self.learner)
         if init_from is not None:
             with fitting(origin['name']):
                 tensors = init_from.completed(self.learner)
-                load_networks(tensors, self.learner, self.experience.statistics)
+                load_networks(tensors, self.modules())
             self._let_critic_learn_first()
-        self.counters = Counters()
         self._part_noise()
-        self._stop_reason = ''
         self._steps_to_refill = 0
         self._clock = RunClock(self.counters)
 
-    def _build_simulations(self) -> None:
-        config, share = self.config, self.workers.share
-        threads, num_envs = self._simulation_threads, share(config.num_envs)
-        self.simulation = make_simulation(config, num_envs, threads)
-        count = min(num_envs, config.evaluation_episodes)
-        self._evaluator = Evaluator(make_simulation(config, count, threads), config)
-        self.spec = self.simulation.spec
+    def modules(self) -> dict[str, nn.Module]:
+        """Return networks and statistics, by their names in a training state."""
+        return {**self.learner.modules(), **self.experience.statistics}
 
     def _seed(self, env_steps: int) -> np.random.Generator:
         """Seed resets and exploration for a run at `env_steps`; return the generator of batches."""
@@ -120,25 +167,12 @@ class Trainer:
         self.collector = make_collector(self.simulation, starts, config)
         return np.random.default_rng(sampler_seed)
 
-    def _build_learner(self) -> None:
-        config, spec = self.config, self.spec
-        sampler = make_sampler(config, self.simulation.metric)
-        generator = self._seed(env_steps=0)
-        self.learner, self.experience = make_learner(
-            config, spec, self.device, self.workers, sampler, generator
-        )
-        require_readable(self.learner)
-
     def _part_noise(self) -> None:
         """Give workers with equal networks different noise."""
         rank = self.workers.rank
         if rank > 0:
             seeds = np.random.SeedSequence([self.config.seed, rank, self.counters.env_steps])
             torch.manual_seed(int(seeds.generate_state(1)[0]))
-
-    def stop(self, reason: str) -> None:
-        """End the run after the current cycle, with a checkpoint."""
-        self._stop_reason = reason
 
     def resume(self, path: Path) -> None:
         """Continue from a training state and the episodes beside it.
@@ -148,7 +182,7 @@ class Trainer:
         Raises:
             ValueError: If the file does not fit the configuration.
         """
-        state = load_state(path, self.learner, self.experience.statistics)
+        state = load_state(path, self.learner, self.modules())
         self.counters = counters = state.counters
         # The new configuration may evaluate more often.
         soonest = counters.env_steps + self.config.evaluate_every
@@ -210,40 +244,44 @@ class Trainer:
             return f'{reason} before; give another {field} to go on'
         self._clock = RunClock(self.counters)
         with _collecting_thread() as executor:
-            submit = executor.submit if self.config.overlap else _run_now
-            collected = self._collect_first(submit)
+            collected = self._collect_first(executor)
             if collected is None:
                 self.save()
                 return self._stop_reason or 'another worker stopped'
             self._warn_of_rewards(collected.episodes)
             while True:
-                collected = self._run_cycle(collected, submit, log)
+                collected = self._run_cycle(collected, executor, log)
                 if reason := self._reason_to_stop():
                     self.save()
                     return reason
                 self._folder.save_when_due(self.learner, self.experience, self.counters)
 
-    def _run_cycle(self, collected: Collected, submit: Submit, log: RunLog | None) -> Collected:
+    def _run_cycle(
+        self, collected: Collected, executor: ThreadPoolExecutor, log: RunLog | None
+    ) -> Collected:
         """Store and learn from the episodes of one cycle; collect those of the next meanwhile."""
         before = time.monotonic()
         self._store(collected)
         if self.config.overlap:
             # At the end, evaluate the actor after this cycle, not before it.
             may_evaluate = self._ended() is None
-            job = submit(self._collect, *self._prepare_collection(may_evaluate))
+            job = executor.submit(self._collect, *self._prepare_collection(may_evaluate))
             losses = self._learn()
         else:
             losses = self._learn()
-            job = submit(self._collect, *self._prepare_collection())
-        collected = self._collect_or_explain(job)
+            job = executor.submit(self._collect, *self._prepare_collection())
+        collected = self._finished(job)
         self._clock.update()
         is_trained = self.counters.updates > 0 or bool(self.config.init_from)
         if collected.evaluation is None and is_trained and self._ended():
             # Evaluate the last actor.
-            collected = submit(self._evaluate, collected, self._actor_to_evaluate()).result()
+            collected = executor.submit(self._evaluate, collected, self._candidate()).result()
         self._keep_best(collected)
         if log is not None:
-            log.write(self._row(collected, losses, time.monotonic() - before))
+            samples = len(losses) * self.experience.batch_size * self.workers.world_size
+            success, seconds = collected.train_success, time.monotonic() - before
+            row = self._row(success, collected.evaluation, samples, seconds)
+            log.write({**row, **loss_columns(losses), **collected.others})
         return collected
 
     def _warn_of_rewards(self, episodes: Episodes) -> None:
@@ -260,7 +298,7 @@ class Trainer:
                 'those of rewards within -1 ... 0. Nothing is learnt from larger rewards.',
             )
 
-    def _collect_first(self, submit: Submit) -> Collected | None:
+    def _collect_first(self, executor: ThreadPoolExecutor) -> Collected | None:
         """Fill the replay of a resumed run if it is missing, then collect the first cycle.
 
         Returns:
@@ -268,7 +306,7 @@ class Trainer:
         """
         while True:
             actor, _ = self._prepare_collection(may_evaluate=False)
-            collected = self._collect_or_explain(submit(self._collect, actor, None))
+            collected = self._finished(executor.submit(self._collect, actor, None))
             filled = self.experience.transitions >= self._steps_to_refill
             if not self.workers.any(not filled):
                 return collected
@@ -276,32 +314,32 @@ class Trainer:
             if self.workers.any(bool(self._stop_reason)):
                 return None
 
-    def _prepare_collection(self, may_evaluate: bool = True) -> tuple[Policy, Actor | None]:
+    def _prepare_collection(self, may_evaluate: bool = True) -> tuple[Policy, Candidate | None]:
         """Prepare collection; return the policy that collects and the actor to evaluate."""
         counters, steps = self.counters, self.counters.env_steps
         self.collector.exploration = self._exploration()
-        actor, evaluated = self.learner.acting_policy(), None
+        policy, candidate = self.learner.acting_policy(), None
         if may_evaluate and counters.updates > 0 and steps >= counters.next_evaluation:
             counters.next_evaluation = steps + self.config.evaluate_every
-            evaluated = self._actor_to_evaluate()
-        return actor, evaluated
+            candidate = self._candidate()
+        return policy, candidate
 
-    def _actor_to_evaluate(self) -> Actor | None:
-        """Return the actor to evaluate; None on all workers but the first."""
+    def _candidate(self) -> Candidate | None:
+        """Return the actor to evaluate and others beside it; None on workers but the first."""
         if not self.workers.is_first:
             return None
-        self._evaluator.others = self.learner.other_policies()
-        return self.learner.evaluation_actor()
+        return self.learner.evaluation_actor(), self.learner.other_policies()
 
-    def _collect(self, policy: Policy, evaluated: Actor | None) -> Collected:
-        return self._evaluate(Collected(*self.collector.collect(policy)), evaluated)
+    def _collect(self, policy: Policy, candidate: Candidate | None) -> Collected:
+        return self._evaluate(Collected(*self.collector.collect(policy)), candidate)
 
-    def _evaluate(self, collected: Collected, actor: Actor | None) -> Collected:
-        if actor is None:
+    def _evaluate(self, collected: Collected, candidate: Candidate | None) -> Collected:
+        if candidate is None:
             return collected
+        actor, others = candidate
         outcomes = self._evaluator.evaluate(actor, self.counters.best_success)
-        others = self._evaluator.evaluate_others()
-        return replace(collected, evaluation=outcomes, evaluated=actor, others=others)
+        rates = {column: self._evaluator.success_of(policy) for column, policy in others.items()}
+        return replace(collected, evaluation=outcomes, evaluated=actor, others=rates)
 
     def _exploration(self) -> float:
         """Return the present share of exploration noise and random actions."""
@@ -309,7 +347,7 @@ class Trainer:
         final = self.config.final_exploration
         return final + (1.0 - final) * min(max(left, 0.0), 1.0)
 
-    def _collect_or_explain(self, job: Future[Collected]) -> Collected:
+    def _finished(self, job: Future[Collected]) -> Collected:
         collected = job.result()
         require_finite_episodes(collected.episodes, self.counters)
         return collected
@@ -350,17 +388,14 @@ class Trainer:
 
     def _keep_best(self, collected: Collected) -> None:
         outcomes, actor = collected.evaluation, collected.evaluated
-        if outcomes is not None and actor is not None and self._evaluator.is_complete(outcomes):
+        if outcomes is None or actor is None:
+            return
+        if len(outcomes) >= self.config.evaluation_episodes:
             self._folder.keep_best(outcomes, actor, self.counters)
 
     def _ended(self) -> tuple[str, str] | None:
         """Return the field that ends the run and the reason in words, or None."""
         return ended_by(self.config, self.counters)
-
-    def _reason_to_stop(self) -> str:
-        _, ended = self._ended() or ('', '')
-        reason = self._stop_reason or ended
-        return (reason or 'another worker stopped') if self.workers.any(bool(reason)) else ''
 
     def save(self) -> None:
         """Write the newest episodes and, as the first worker, the latest actor and the state.
@@ -369,17 +404,6 @@ class Trainer:
             OSError: If a file cannot be written; the earlier files stay.
         """
         self._folder.save(self.learner, self.experience, self.counters)
-
-    def _row(
-        self, collected: Collected, losses: list[Losses], seconds: float
-    ) -> dict[str, float | None]:
-        workers, rule = self.workers.world_size, self.config.success_rule
-        success, outcomes = collected.train_success, collected.evaluation
-        row = progress_row(self.counters, success, outcomes, rule, losses)
-        steps = self.simulation.num_envs * self.spec.episode_ticks * workers
-        row['steps_per_second'] = steps / seconds
-        row['samples_per_second'] = len(losses) * self.experience.batch_size * workers / seconds
-        return row | collected.others
 
 
 @contextmanager
@@ -396,10 +420,3 @@ def _collecting_thread() -> Iterator[ThreadPoolExecutor]:
         raise
     finally:
         executor.shutdown(wait=not is_interrupted, cancel_futures=True)
-
-
-def _run_now(function: Callable[..., Collected], *arguments: Any) -> Future[Collected]:
-    """Run a job in this thread, with the interface of an executor."""
-    future: Future[Collected] = Future()
-    future.set_result(function(*arguments))
-    return future

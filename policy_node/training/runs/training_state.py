@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -23,7 +23,6 @@ from policy_node.policies.files import (
     write_file,
 )
 from policy_node.training.configuration.config import Limits
-from policy_node.training.experience.experience import RunningStatistics
 from policy_node.training.experience.replay import Episodes
 from policy_node.training.learners.actor_critic import ActorCritic, Losses
 
@@ -103,22 +102,19 @@ class TrainingState:
 def save_state(
     path: Path,
     learner: ActorCritic,
-    statistics: dict[str, RunningStatistics],
+    statistics: Mapping[str, nn.Module],
     counters: Counters,
     extra: dict[str, Any],
 ) -> None:
     """Write all that a resumed run needs, except the replay; `extra` contains JSON values."""
     tensors: dict[str, Tensor] = {'torch_generator': torch.get_rng_state()}
-    for part, module in learner.modules().items():
+    for part, module in {**learner.modules(), **statistics}.items():
         for name, value in module.state_dict().items():
             tensors[f'{part}.{name}'] = value.detach().cpu()
     for part, optimizer in learner.optimizers().items():
         for index, state in optimizer.state_dict()['state'].items():
             for name, value in state.items():
                 tensors[f'{part}.{index}.{name}'] = value.detach().cpu()
-    for part, running in statistics.items():
-        for name, value in running.state().items():
-            tensors[f'{part}.{name}'] = value
     write_file(path, state_bytes(TrainingState(tensors, counters, extra)))
 
 
@@ -220,10 +216,8 @@ def first_not_finite(tensors: Mapping[str, Tensor]) -> str:
     return ''
 
 
-def load_state(
-    path: Path, learner: ActorCritic, statistics: dict[str, RunningStatistics]
-) -> TrainingState:
-    """Load a file into learner and normalisers, and return its contents.
+def load_state(path: Path, learner: ActorCritic, modules: dict[str, nn.Module]) -> TrainingState:
+    """Load a file into a learner and modules, and return its contents.
 
     Raises:
         ValueError: If the file is not a training state or its tensors do not fit.
@@ -231,7 +225,7 @@ def load_state(
     state = read_state(path)
     with fitting(path):
         torch.set_rng_state(state.tensors['torch_generator'])
-        load_networks(state.tensors, learner, statistics)
+        load_networks(state.tensors, modules)
         for part, optimizer in learner.optimizers().items():
             _load_optimizer(optimizer, part_of(state.tensors, part))
         if state.counters.updates > 0 and not part_of(state.tensors, 'critic_optimizer'):
@@ -258,21 +252,16 @@ def fitting(source: object) -> Iterator[None]:
         raise ValueError(f'{source} does not fit this configuration: {reason}') from None
 
 
-def load_networks(
-    tensors: dict[str, Tensor], learner: ActorCritic, statistics: dict[str, RunningStatistics]
-) -> None:
-    """Load networks and normalisers; without a critic the learner keeps its own.
+def load_networks(tensors: dict[str, Tensor], modules: dict[str, nn.Module]) -> None:
+    """Load networks and statistics; without a critic the run keeps its own.
 
     Raises:
-        RuntimeError: If sizes do not fit.
-        KeyError: If a part is incomplete.
+        RuntimeError: If sizes do not fit or a part is incomplete.
     """
-    tensors = _with_copies(tensors, learner)
-    for part, module in learner.modules().items():
-        if part_of(tensors, part) or 'actor' in part:
+    tensors = _with_copies(tensors, modules)
+    for part, module in modules.items():
+        if part_of(tensors, part) or 'actor' in part or 'statistics' in part:
             module.load_state_dict(part_of(tensors, part))
-    for part, running in statistics.items():
-        running.load_state(part_of(tensors, part))
 
 
 def part_of(tensors: dict[str, Tensor], part: str) -> dict[str, Tensor]:
@@ -285,7 +274,7 @@ def part_of(tensors: dict[str, Tensor], part: str) -> dict[str, Tensor]:
     }
 
 
-def _with_copies(tensors: dict[str, Tensor], learner: ActorCritic) -> dict[str, Tensor]:
+def _with_copies(tensors: dict[str, Tensor], modules: Iterable[str]) -> dict[str, Tensor]:
     """Add targets and average if they are missing, as copies of actor and critic."""
     sources = {
         'target_actor': 'actor.network',
@@ -294,7 +283,7 @@ def _with_copies(tensors: dict[str, Tensor], learner: ActorCritic) -> dict[str, 
     }
     copies = {
         f'{part}.{name}': value
-        for part in learner.modules()
+        for part in modules
         for ending, source in sources.items()
         if part.endswith(ending) and not part_of(tensors, part)
         for name, value in part_of(tensors, part.removesuffix(ending) + source).items()
