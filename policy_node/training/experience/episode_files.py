@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from safetensors import SafetensorError
-from safetensors.numpy import load_file, save_file
+from safetensors.numpy import load_file
 
 from fetch_hand_sim.episode_log import EpisodeArrays, load_episodes
 from fetch_hand_sim.episode_log.files import holds_no_episode
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ, TaskSpec
+from policy_node.policies.files import write_tensors
 from policy_node.training.experience.replay import EpisodeReplay, Episodes
 
 
@@ -23,19 +23,7 @@ def save_replay(path: Path, replay: EpisodeReplay, transitions: int) -> None:
         OSError: If the file cannot be written; no partial file is left.
     """
     newest = replay.newest(-(-transitions // replay.ticks))
-    tensors = {name: getattr(newest, name) for name in Episodes.__slots__}
-    partial = path.with_name(f'.{path.name}.partial')
-    path.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        partial.touch()
-        mode = partial.stat().st_mode
-        save_file(tensors, partial)
-        # safetensors lets only the owner read its files; the other files of a run follow umask.
-        partial.chmod(mode)
-        os.replace(partial, path)
-    except (OSError, SafetensorError) as error:
-        partial.unlink(missing_ok=True)
-        raise OSError(f'{path} cannot be written: {error}') from None
+    write_tensors(path, {name: getattr(newest, name) for name in Episodes.__slots__}, {})
 
 
 def load_replay(path: Path, replay: EpisodeReplay) -> None:

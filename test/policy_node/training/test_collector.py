@@ -19,23 +19,23 @@ from policy_node.training.experience.replay import Episodes
 torch.set_num_threads(1)
 
 
-def make_collector(noise_std: float = 0.2, random_epsilon: float = 0.3, envs: int = 4) -> Collector:
+def make_collector(noise_std=0.2, random_epsilon=0.3, envs=4):
     simulation = Simulation('FetchReach', num_envs=envs, num_threads=1)
     config = from_flat({'task': 'FetchReach'}, noise_std=noise_std, random_epsilon=random_epsilon)
     return Collector(simulation, [10 * i for i in range(envs)], config)
 
 
-def make_actor() -> Actor:
+def make_actor():
     torch.manual_seed(0)
     return Actor(NetworkShape(10, 3, 4, (16,))).eval()
 
 
-def assert_equal(first: Episodes, second: Episodes) -> None:
+def assert_equal(first, second):
     for name in Episodes.__slots__:
         np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
 
 
-def test_episodes_are_what_the_simulation_does_with_the_actions() -> None:
+def test_episodes_are_what_the_simulation_does_with_the_actions():
     collector = make_collector()
     episodes, success = collector.collect(make_actor())
     assert (len(episodes), episodes.ticks) == (4, 50)
@@ -56,7 +56,7 @@ def test_episodes_are_what_the_simulation_does_with_the_actions() -> None:
     assert success == reached.mean()
 
 
-def test_without_noise_the_policy_acts_alone() -> None:
+def test_without_noise_the_policy_acts_alone():
     actor = make_actor()
     episodes, _ = make_collector(0.0, 0.0).collect(actor)
     inputs = {
@@ -67,7 +67,7 @@ def test_without_noise_the_policy_acts_alone() -> None:
 
 
 @pytest.mark.parametrize('epsilon', [0.0, 0.3])
-def test_noise_has_the_spread_and_the_share_asked_for(epsilon: float) -> None:
+def test_noise_has_the_spread_and_the_share_asked_for(epsilon):
     episodes, _ = make_collector(0.1, epsilon, envs=40).collect(RestingPolicy(4))
     actions = episodes.action.reshape(-1, 4)
     assert np.abs(actions).max() <= 1.0
@@ -78,14 +78,14 @@ def test_noise_has_the_spread_and_the_share_asked_for(epsilon: float) -> None:
     assert inside.std() == pytest.approx(0.1, abs=0.012)
 
 
-def test_the_second_cycle_has_new_goals() -> None:
+def test_the_second_cycle_has_new_goals():
     collector = make_collector()
     first, _ = collector.collect(make_actor())
     second, _ = collector.collect(make_actor())
     assert (first.desired_goal != second.desired_goal).all()
 
 
-def test_the_same_seeds_give_the_same_episodes_in_any_thread() -> None:
+def test_the_same_seeds_give_the_same_episodes_in_any_thread():
     here, _ = make_collector().collect(make_actor())
     with ThreadPoolExecutor(1) as executor:
         there, _ = executor.submit(make_collector().collect, make_actor()).result()

@@ -11,7 +11,7 @@ import pytest
 
 from msgs_spec.tasks import TASKS
 from node_runtime.command_line import CommandParser
-from policy_node.training.configuration.config import TrainConfig, idle_parts
+from policy_node.training.configuration.config import idle_parts
 from policy_node.training.configuration.flat import (
     FIELDS,
     RESEARCH,
@@ -29,10 +29,11 @@ from policy_node.training.studies.research import STUDIES
 from policy_node.training.train_her import config_from_arguments, parse_arguments
 from support import ROOT
 
+PEN = {'task': 'HandManipulatePenRotate', 'ticks_after_drop': 3}
 PPO = {'algorithm': 'ppo', 'overlap': False}
 
 
-def test_the_paper_recipe_is_appendix_b() -> None:
+def test_the_paper_recipe_is_appendix_b():
     push = to_flat(recipe_config('FetchPush', 'paper'))
     block = to_flat(recipe_config('HandManipulateBlockFull', 'paper'))
     assert push['hidden_sizes'] == (256, 256, 256) and not push['layer_norm']
@@ -49,31 +50,31 @@ def test_the_paper_recipe_is_appendix_b() -> None:
 
 @pytest.mark.parametrize('task', TASKS)
 @pytest.mark.parametrize('recipe', FROM_NOTHING)
-def test_recipes_exist_for_every_task_and_survive_json(task: str, recipe: str) -> None:
+def test_recipes_exist_for_every_task_and_survive_json(task, recipe):
     config = recipe_config(task, recipe, seed=3)
     assert (config.task, config.recipe, config.seed) == (task, recipe, 3)
     stored = json.loads(json.dumps(to_flat(config)))
     assert config_from_dict(stored) == config
 
 
-def test_every_field_is_explained() -> None:
+def test_every_field_is_explained():
     assert all(each.meaning.endswith('.') for each in FIELDS.values())
 
 
-def switches() -> dict[str, str]:
+def switches():
     """Rows of the tables of switches in the reference, by field."""
     page = (ROOT / 'docs' / 'reference' / 'training_fields.md').read_text()
     rows = re.findall(r'^\| (`.*) \|$', page.partition('## Switches')[2].split('\n## ')[0], re.M)
     return {field: row for row in rows for field in re.findall(r'(\w+)=', row.split(' | ')[0])}
 
 
-def test_switches_on_the_page_are_fields_with_values_they_take() -> None:
+def test_switches_on_the_page_are_fields_with_values_they_take():
     for row in switches().values():
         for words in re.findall('`(.*?)`', row.split(' | ')[0]):
             assert all(parse_assignment(word) for word in words.split()), words
 
 
-def test_what_a_study_switches_is_on_the_page_with_a_request() -> None:
+def test_what_a_study_switches_is_on_the_page_with_a_request():
     rows = switches()
     # Settings of any run, which some arms have as well.
     ordinary = {'strategy', 'goals', 'target_update_interval', 'moved_share', 'updates_per_cycle'}
@@ -94,11 +95,11 @@ def test_what_a_study_switches_is_on_the_page_with_a_request() -> None:
         ('strategy=final', ('strategy', 'final')),
     ],
 )
-def test_assignments_take_the_type_of_the_field(text: str, expected: tuple[str, object]) -> None:
+def test_assignments_take_the_type_of_the_field(text, expected):
     assert parse_assignment(text) == expected
 
 
-def test_scalars_of_numpy_are_values_of_python() -> None:
+def test_scalars_of_numpy_are_values_of_python():
     """Those of `np.linspace`, and of what was read from a file."""
     given = {
         'gamma': np.float64(0.9),
@@ -125,7 +126,7 @@ def test_scalars_of_numpy_are_values_of_python() -> None:
         ('hidden_sizes=wide', "hidden_sizes 'wide' is not numbers with commas"),
     ],
 )
-def test_bad_assignments_are_refused(text: str, match: str) -> None:
+def test_bad_assignments_are_refused(text, match):
     with pytest.raises(ValueError, match=re.escape(match) if '.' in match else match):
         parse_assignment(text)
 
@@ -151,17 +152,8 @@ def test_bad_assignments_are_refused(text: str, match: str) -> None:
         ({'reward_grades': '2,1'}, 'rising numbers above 0 and below 1000'),
         ({'reward_grades': 'all'}, "reward_grades 'all' is not numbers"),
         ({'reward_grades': '1,2', 'condition': 'threshold'}, 'condition excludes reward_grades'),
-        (
-            {
-                'task': 'HandManipulatePenRotate',
-                'ticks_after_drop': 3,
-                'drop_is_lost': True,
-                'condition': 'horizon',
-            },
-            'it excludes condition horizon',
-        ),
+        ({**PEN, 'drop_is_lost': True, 'condition': 'horizon'}, 'it excludes condition horizon'),
         ({'trace': 0.5}, 'trace 0.5 has no effect'),
-        ({'hidden_sizes': (0,)}, 'hidden_sizes'),
         ({'retry_failed': 0.5}, 'unknown configuration fields: retry_failed'),
         (
             {'importance': 'density', 'goals': 'future=1'},
@@ -212,7 +204,7 @@ def test_bad_assignments_are_refused(text: str, match: str) -> None:
         ({'control_hz': 60.0}, 'control_hz'),
     ],
 )
-def test_bad_values_are_refused(changes: dict[str, object], match: str) -> None:
+def test_bad_values_are_refused(changes, match):
     with pytest.raises(ValueError, match=match) as raised:
         recipe_config(**{'task': 'FetchPush', 'recipe': 'best', **changes})
     assert '\n' not in str(raised.value)
@@ -237,9 +229,7 @@ def test_bad_values_are_refused(changes: dict[str, object], match: str) -> None:
         ({**PPO, 'learning_starts': 100_000}, ['nothing']),
     ],
 )
-def test_idle_parts_of_learning_are_named_in_a_line(
-    changes: dict[str, object], idle: list[str]
-) -> None:
+def test_idle_parts_of_learning_are_named_in_a_line(changes, idle):
     lines = [*idle_parts(recipe_config('FetchReach', 'best', **changes))]
     assert [
         word
@@ -249,7 +239,7 @@ def test_idle_parts_of_learning_are_named_in_a_line(
     assert len(lines) == len(idle)
 
 
-def test_an_unknown_recipe_or_stored_field_is_refused() -> None:
+def test_an_unknown_recipe_or_stored_field_is_refused():
     with pytest.raises(ValueError, match="recipe 'good'; allowed: paper, best, robust, finetune"):
         recipe_config('FetchPush', 'good')
     stored = to_flat(recipe_config('FetchPush', 'best'))
@@ -257,7 +247,7 @@ def test_an_unknown_recipe_or_stored_field_is_refused() -> None:
         config_from_dict({**stored, 'colour': 1})
 
 
-def test_threads_share_the_cores(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_threads_share_the_cores(monkeypatch):
     monkeypatch.setattr(os, 'sched_getaffinity', lambda _: set(range(8)), raising=False)
     small = recipe_config('FetchPush', 'best', batch_size=1024)
     assert split_threads(small) == (7, 1)
@@ -268,14 +258,14 @@ def test_threads_share_the_cores(monkeypatch: pytest.MonkeyPatch) -> None:
     assert split_threads(small) == (1, 1)
 
 
-def options_of(*arguments: str) -> dict[str, object]:
+def options_of(*arguments):
     parser = CommandParser(prog='fetch_hand_sim train')
     add_field_options(parser, without=('task', 'recipe'))
     return given_fields(parser.parse_args(arguments))
 
 
-def test_task_and_recipe_may_be_set_like_any_field() -> None:
-    def config(*arguments: str) -> TrainConfig:
+def test_task_and_recipe_may_be_set_like_any_field():
+    def config(*arguments):
         return config_from_arguments(parse_arguments(arguments))
 
     assert config('--set', 'task=FetchPush').task == 'FetchPush'
@@ -286,9 +276,7 @@ def test_task_and_recipe_may_be_set_like_any_field() -> None:
 
 
 @pytest.mark.parametrize('option', ['--help', '--help-research'])
-def test_help_explains_every_field_and_keeps_studies_apart(
-    option: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_help_explains_every_field_and_keeps_studies_apart(option, capsys):
     with pytest.raises(SystemExit):
         options_of(option)
     said = ' '.join(capsys.readouterr().out.split())
@@ -301,7 +289,7 @@ def test_help_explains_every_field_and_keeps_studies_apart(
     assert [name for name in shown if FIELDS[name].meaning.replace(' ', '') not in packed] == []
 
 
-def test_options_become_fields_of_their_types_and_nothing_else_is_set() -> None:
+def test_options_become_fields_of_their_types_and_nothing_else_is_set():
     assert options_of() == {}
     given = options_of(
         *('--learning-rate', '1e-4', '--steps', '2_000', '--no-overlap', '--layer-norm'),
@@ -316,19 +304,14 @@ def test_options_become_fields_of_their_types_and_nothing_else_is_set() -> None:
         'goals': {'future': 0.4, 'actual': 0.4},
         'simulation_threads': 2,
     }
-
-
-@pytest.mark.parametrize('text', ['1000000', '1_000_000', '1e6', '1.0e6'])
-def test_steps_are_whole_however_they_are_written(text: str) -> None:
-    assert options_of('--steps', text) == {'total_steps': 1_000_000}
+    for text in ('1000000', '1_000_000', '1e6', '1.0e6'):
+        assert options_of('--steps', text) == {'total_steps': 1_000_000}
 
 
 @pytest.mark.parametrize(
     ('arguments', 'message'),
     [
         (['--learning-rte', '1'], "--learning-rte 1; did you mean '--learning-rate'?"),
-        (['--gamma', 'high'], "gamma 'high' is not of type float"),
-        (['--hidden-sizes', 'abc'], "hidden_sizes 'abc' is not numbers with commas"),
         (['--nosuchthing'], 'unrecognized arguments: --nosuchthing'),
         (['--gamble', 'true'], 'switches take no value: --name is on, --no-name is off'),
         (['--steps', '1e6.5'], "total_steps '1e6.5' is not of type int"),
@@ -336,9 +319,7 @@ def test_steps_are_whole_however_they_are_written(text: str) -> None:
         (['--steps', '1e29'], "total_steps '1e29' is not of type int"),
     ],
 )
-def test_what_was_mistyped_is_answered_in_a_line(
-    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_was_mistyped_is_answered_in_a_line(arguments, message, capsys):
     with pytest.raises(SystemExit) as ended:
         options_of(*arguments)
     error = capsys.readouterr().err

@@ -2,24 +2,18 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
 
-from policy_node.training.configuration.recipes import recipe_config
 from policy_node.training.critic_bias import main
-from policy_node.training.machine import Workers
-from policy_node.training.runs.trainer import Trainer
 from policy_node.training.values_and_returns import discounted, measure
+from support.runs import trainer_of
 
-TINY = {'num_envs': 2, 'evaluation_episodes': 2, 'simulation_threads': 1, 'torch_threads': 1}
 
-
-def saved_run(folder: Path, value: float, **changes: object) -> Path:
+def saved_run(folder, value, **changes):
     """A run of FetchReach whose critic is constant."""
-    trainer = Trainer(recipe_config('FetchReach', 'best', **TINY, **changes), folder, Workers())
+    trainer = trainer_of(folder, num_envs=2, evaluation_episodes=2, **changes)
     critic = trainer.learner.critic
     with torch.no_grad():
         for name, parameter in critic.named_parameters():
@@ -29,7 +23,7 @@ def saved_run(folder: Path, value: float, **changes: object) -> Path:
     return folder
 
 
-def test_returns_go_on_as_the_last_ticks_were() -> None:
+def test_returns_go_on_as_the_last_ticks_were():
     rewards = np.full((30, 2), -1.0)
     rewards[20:, 1] = 0.0
     returns = discounted(rewards, 0.9)
@@ -40,9 +34,7 @@ def test_returns_go_on_as_the_last_ticks_were() -> None:
     np.testing.assert_allclose(returns[19, 1], -1.0 + 0.9**11 * following)
 
 
-def test_a_critic_that_overestimates_is_shown(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_critic_that_overestimates_is_shown(tmp_path, capsys):
     """An untrained actor always fails: the return of its actions is -1/(1 - gamma)."""
     run = saved_run(tmp_path, value=-3.0)
     found = measure(run, episodes=4)
@@ -56,7 +48,7 @@ def test_a_critic_that_overestimates_is_shown(
 
 
 @pytest.mark.parametrize('critics', [1, 2])
-def test_quantiles_have_the_value_of_their_mean(tmp_path: Path, critics: int) -> None:
+def test_quantiles_have_the_value_of_their_mean(tmp_path, critics):
     many = {'quantiles': 5, 'critics': critics, 'aggregate': 'truncated'}
     run = saved_run(tmp_path, value=-3.0, **many)
     assert [each.value for each in measure(run, episodes=2)] == pytest.approx([-3.0] * 3)
@@ -70,12 +62,7 @@ def test_quantiles_have_the_value_of_their_mean(tmp_path: Path, critics: int) ->
         (None, 'is no file'),
     ],
 )
-def test_runs_without_values_of_actions_are_rejected(
-    tmp_path: Path,
-    changes: dict[str, object] | None,
-    message: str,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_runs_without_values_of_actions_are_rejected(tmp_path, changes, message, capsys):
     if changes is not None:
         saved_run(tmp_path, value=0.0, **changes)
     assert main([str(tmp_path)]) == 2

@@ -5,54 +5,39 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from safetensors.numpy import load_file, save_file
 
 from policy_node.policies.files import read_tensors, write_tensors
 from policy_node.policies.loading import shipped_actors
-from policy_node.training.configuration.recipes import recipe_config
-from policy_node.training.machine import Workers, available_memory
+from policy_node.training.machine import available_memory
 from policy_node.training.runs import run as run_module
 from policy_node.training.runs.initial_networks import read_initial_networks
 from policy_node.training.runs.run_log import read_progress
-from policy_node.training.runs.trainer import Trainer
 from policy_node.training.runs.training_state import read_counters
 from policy_node.training.train_her import main
+from support.runs import SMALL, STATE, one_line, options_of, trained
 
-torch.set_num_threads(1)
-
-SMALL: dict[str, Any] = {'num_envs': 8, 'updates_per_cycle': 4, 'batch_size': 64}
-SMALL |= {'evaluation_episodes': 8, 'simulation_threads': 1, 'torch_threads': 1}
-SMALL |= {'evaluate_every': 400, 'hidden_sizes': (16, 16)}
-STATE, REPLAY, BEST = 'training_state.safetensors', 'replay.safetensors', 'best.safetensors'
+FIELDS = SMALL | {'hidden_sizes': (16, 16)}
+REPLAY, BEST = 'replay.safetensors', 'best.safetensors'
 
 
 @pytest.fixture(scope='module')
-def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def finished(tmp_path_factory):
     folder = tmp_path_factory.mktemp('trained') / 'run'
-    config = recipe_config('FetchReach', 'best', **SMALL, total_steps=1_200)
-    Trainer(config, folder, Workers()).train()
+    trained(folder, hidden_sizes=(16, 16), total_steps=1_200)
     return folder
 
 
 @pytest.fixture
-def run(trained: Path, tmp_path: Path) -> Path:
+def run(finished, tmp_path):
     """A run of 1,200 steps."""
-    return shutil.copytree(trained, tmp_path / 'run')
+    return shutil.copytree(finished, tmp_path / 'run')
 
 
-def change_state(
-    run: Path,
-    change: Callable[[dict[str, np.ndarray]], object] = lambda tensors: None,
-    counters: dict[str, Any] | None = None,
-    **extra: Any,
-) -> None:
+def change_state(run, change=lambda tensors: None, counters=None, **extra):
     tensors, metadata = read_tensors(run / STATE)
     tensors = dict(tensors)
     change(tensors)
@@ -61,11 +46,9 @@ def change_state(
     write_tensors(run / STATE, tensors, metadata)
 
 
-def refusal(run: Path, capsys: pytest.CaptureFixture[str], *more: str) -> str:
+def refusal(run, capsys, *more):
     assert main(['--resume', str(run), '--steps', '1600', *more]) == 2
-    error = capsys.readouterr().err
-    assert error.count('\n') == 1
-    return error
+    return one_line(capsys)
 
 
 @pytest.mark.parametrize(
@@ -82,9 +65,7 @@ def refusal(run: Path, capsys: pytest.CaptureFixture[str], *more: str) -> str:
         ({'zzz': 1}, "'zzz'"),
     ],
 )
-def test_invalid_counters_are_rejected(
-    run: Path, counters: dict[str, Any], message: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_invalid_counters_are_rejected(run, counters, message, capsys):
     change_state(run, counters=counters)
     error = refusal(run, capsys)
     assert message in error and str(run / STATE) in error
@@ -92,27 +73,27 @@ def test_invalid_counters_are_rejected(
         read_counters(run / STATE)
 
 
-def test_an_invalid_origin_is_rejected(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_invalid_origin_is_rejected(run, capsys):
     change_state(run, init_from=[1])
     assert 'init_from is not an object' in refusal(run, capsys)
 
 
-def nan_in(name: str) -> Callable[[dict[str, np.ndarray]], None]:
-    def change(tensors: dict[str, np.ndarray]) -> None:
+def nan_in(name):
+    def change(tensors):
         tensors[name] = np.full_like(tensors[name], np.nan)
 
     return change
 
 
-def shorter(name: str) -> Callable[[dict[str, np.ndarray]], None]:
-    def change(tensors: dict[str, np.ndarray]) -> None:
+def shorter(name):
+    def change(tensors):
         tensors[name] = tensors[name][:1]
 
     return change
 
 
-def without(prefix: str) -> Callable[[dict[str, np.ndarray]], None]:
-    def change(tensors: dict[str, np.ndarray]) -> None:
+def without(prefix):
+    def change(tensors):
         for name in [name for name in tensors if name.startswith(prefix)]:
             del tensors[name]
 
@@ -125,24 +106,19 @@ def without(prefix: str) -> Callable[[dict[str, np.ndarray]], None]:
         (nan_in('actor.network.output.bias'), 'actor.network.output.bias'),
         # Adam's fused step would write beyond the end of these.
         (shorter('critic_optimizer.0.exp_avg'), 'exp_avg of parameter 0 is (1, 17) torch.float32'),
-        (shorter('observation_statistics.total'), 'total of inputs is (1,), not (10,)'),
+        (shorter('observation_statistics.total'), 'RunningStatistics: size mismatch for total'),
         (without('critic_optimizer.1.step'), 'parameter 1 has'),
         (without('critic_optimizer.'), 'critic_optimizer is missing'),
-        (without('goal_statistics.count'), 'count is missing'),
+        (without('goal_statistics.count'), 'Missing key(s) in state_dict: "count"'),
         (shorter('actor.network.output.bias'), 'Actor: size mismatch for network.output.bias'),
     ],
 )
-def test_invalid_tensors_are_rejected(
-    run: Path,
-    change: Callable[[dict[str, np.ndarray]], None],
-    message: str,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_invalid_tensors_are_rejected(run, change, message, capsys):
     change_state(run, change)
     assert message in refusal(run, capsys)
 
 
-def test_no_run_starts_from_networks_that_are_not_finite(run: Path) -> None:
+def test_no_run_starts_from_networks_that_are_not_finite(run):
     change_state(run, nan_in('critic.network.output.bias'))
     with pytest.raises(ValueError, match=r'critic\.network\.output\.bias'):
         read_initial_networks(str(run))
@@ -158,13 +134,7 @@ def test_no_run_starts_from_networks_that_are_not_finite(run: Path) -> None:
         ('action', lambda a: np.zeros((), np.float32).reshape(1)[0:1], 'observation is (24, 51'),
     ],
 )
-def test_an_invalid_replay_is_collected_again(
-    run: Path,
-    name: str,
-    change: Callable[[np.ndarray], np.ndarray],
-    message: str,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_an_invalid_replay_is_collected_again(run, name, change, message, capsys):
     tensors = load_file(run / REPLAY)
     save_file(tensors | {name: change(tensors[name])}, run / REPLAY)
     assert main(['--resume', str(run), '--steps', '1600']) == 0
@@ -174,9 +144,7 @@ def test_an_invalid_replay_is_collected_again(
 
 
 @pytest.mark.parametrize('content', [bytes(range(256)) * 10, b'env_steps\n9999\n'])
-def test_an_invalid_log_does_not_stop_a_run(
-    run: Path, content: bytes, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_invalid_log_does_not_stop_a_run(run, content, capsys):
     (run / 'progress.csv').write_bytes(content)
     assert main(['--resume', str(run), '--steps', '1600']) == 0
     assert [row['env_steps'] for row in read_progress(run / 'progress.csv')] == [1_600]
@@ -184,9 +152,7 @@ def test_an_invalid_log_does_not_stop_a_run(
 
 
 @pytest.mark.parametrize('there', [None, shipped_actors()['FetchPush'].read_bytes()])
-def test_a_missing_best_actor_is_replaced(
-    run: Path, there: bytes | None, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_missing_best_actor_is_replaced(run, there, capsys):
     change_state(run, counters={'best_success': 1.0, 'best_return': 0.0})
     (run / BEST).unlink() if there is None else (run / BEST).write_bytes(there)
     assert main(['--resume', str(run), '--steps', '1600']) == 0
@@ -201,9 +167,7 @@ def test_a_missing_best_actor_is_replaced(
         {'episodes': 1000, 'rule': 'gymnasium', 'mean_return': None, 'last_step': 0.5},
     ],
 )
-def test_a_best_actor_with_an_invalid_evaluation_has_no_effect(
-    run: Path, success: dict[str, object], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_best_actor_with_an_invalid_evaluation_has_no_effect(run, success, capsys):
     tensors, metadata = read_tensors(run / BEST)
     write_tensors(run / BEST, tensors, metadata | {'success': json.dumps(success)})
     assert main(['--resume', str(run), '--steps', '1600']) == 0
@@ -211,29 +175,25 @@ def test_a_best_actor_with_an_invalid_evaluation_has_no_effect(
     assert 'Traceback' not in said.err and 'best success 5' not in said.out
 
 
-def test_a_curve_with_no_place_does_not_fail_the_run(
-    run: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_curve_with_no_place_does_not_fail_the_run(run, capsys):
     (run / 'curve.png').unlink(missing_ok=True)
     (run / 'curve.png').mkdir()
     assert main(['--resume', str(run), '--steps', '1600']) == 0
     assert 'no curve, the run itself is saved: ' in capsys.readouterr().err
 
 
-def test_a_folder_without_a_run_is_rejected(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_folder_without_a_run_is_rejected(run, capsys):
     assert 'best.safetensors is not the folder of a run' in refusal(run / BEST, capsys)
     assert 'nothere is not the folder of a run' in refusal(run / 'nothere', capsys)
 
 
 @pytest.mark.parametrize('resumed', [True, False])
-def test_a_full_disk_is_reported_with_the_file(
-    run: Path, resumed: bool, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def full(descriptor: int) -> None:
+def test_a_full_disk_is_reported_with_the_file(run, resumed, capsys, monkeypatch):
+    def full(descriptor):
         raise OSError(28, 'No space left on device')
 
     monkeypatch.setattr(os, 'fsync', full)
-    fields = [f'--set={name}={value}' for name, value in SMALL.items() if name != 'hidden_sizes']
+    fields = options_of(**FIELDS)
     fresh = ['--task', 'FetchReach', '--output', str(run.parent / 'new'), *fields]
     where = ['--resume', str(run)] if resumed else fresh
     assert main([*where, '--steps', '1600']) == 1
@@ -244,20 +204,17 @@ def test_a_full_disk_is_reported_with_the_file(
     assert said.endswith(kept if resumed else none)
 
 
-def test_a_run_larger_than_the_memory_is_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_larger_than_the_memory_is_one_line(tmp_path, capsys):
     arguments = ['--task', 'FetchReach', '--threads', '1', '--torch-threads', '1']
     size = 'replay_transitions=10000000000000'
     assert main([*arguments, '--set', size, '--output', str(tmp_path)]) == 2
-    error = capsys.readouterr().err
-    assert 'not enough memory; use smaller replay_transitions' in error and error.count('\n') == 1
+    assert 'not enough memory; use smaller replay_transitions' in one_line(capsys)
 
 
 @pytest.mark.release
 def test_a_replay_that_will_exceed_the_memory_is_reported_at_the_start(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+    tmp_path, monkeypatch, capsys
+):
     # A step of FetchReach is 10 + 3 + 4 numbers of 4 bytes; an episode has one observation more and
     # a goal.
     whole = 16 * (51 * 13 + 3 + 50 * 4) * 4
@@ -270,6 +227,6 @@ def test_a_replay_that_will_exceed_the_memory_is_reported_at_the_start(
         assert ('a smaller replay_transitions would fit' in capsys.readouterr().err) == warns
 
 
-def test_the_available_memory_is_known_here() -> None:
+def test_the_available_memory_is_known_here():
     available = available_memory()
     assert available is not None and 10**7 < available < 10**14

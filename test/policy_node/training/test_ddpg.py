@@ -12,7 +12,6 @@ from policy_node.policies.actor import MLP
 from policy_node.policies.network_shape import NetworkShape
 from policy_node.training.configuration.recipes import recipe_config
 from policy_node.training.experience.replay import Transitions
-from policy_node.training.learners.ddpg import DDPG
 from policy_node.training.machine import Workers, choose_device, uses_bfloat16
 from policy_node.training.research.judged import Judge
 from policy_node.training.research.registry import make_ddpg
@@ -24,7 +23,7 @@ SHAPE = NetworkShape(observation_size=3, goal_size=2, action_size=2, hidden_size
 CPU = torch.device('cpu')
 
 
-def make_learner(layer_norm: bool = False, **changes: object) -> DDPG:
+def make_learner(layer_norm=False, **changes):
     torch.manual_seed(0)
     options = {'precision': 'float32', 'gamma': 0.9, **changes}
     config = recipe_config('FetchReach', 'paper', **options)
@@ -32,10 +31,10 @@ def make_learner(layer_norm: bool = False, **changes: object) -> DDPG:
     return make_ddpg(shape, config, CPU, Workers())
 
 
-def make_batch(count: int = 64, seed: int = 0, reward: float | None = None) -> Transitions:
+def make_batch(count=64, seed=0, reward=None):
     generator = np.random.default_rng(seed)
 
-    def normal(*shape: int) -> np.ndarray:
+    def normal(*shape):
         return generator.normal(size=shape).astype(np.float32)
 
     rewards = -generator.integers(0, 2, count).astype(np.float32)
@@ -49,11 +48,11 @@ def make_batch(count: int = 64, seed: int = 0, reward: float | None = None) -> T
     )
 
 
-def torch_arrays(*arrays: np.ndarray) -> list[torch.Tensor]:
+def torch_arrays(*arrays):
     return [torch.from_numpy(array) for array in arrays]
 
 
-def forward(module: MLP, inputs: np.ndarray) -> np.ndarray:
+def forward(module, inputs):
     """The network in numpy."""
     layer = inputs
     for part in module.hidden:
@@ -64,7 +63,7 @@ def forward(module: MLP, inputs: np.ndarray) -> np.ndarray:
     return layer @ module.output.weight.detach().numpy().T + module.output.bias.detach().numpy()
 
 
-def test_targets_are_clipped_bootstrapped_values() -> None:
+def test_targets_are_clipped_bootstrapped_values():
     learner = make_learner()
     with torch.no_grad():
         learner.target_critic.network.output.weight.mul_(40.0)
@@ -79,7 +78,7 @@ def test_targets_are_clipped_bootstrapped_values() -> None:
     assert (expected == 0).any() and (expected == -10).any()
 
 
-def test_the_first_losses_are_those_of_the_definition() -> None:
+def test_the_first_losses_are_those_of_the_definition():
     learner = make_learner(action_l2=0.7)
     before = copy.deepcopy(learner)
     batch = make_batch()
@@ -98,7 +97,7 @@ def test_the_first_losses_are_those_of_the_definition() -> None:
     assert losses.actor.item() == pytest.approx(actor_loss, rel=1e-4, abs=1e-6)
 
 
-def test_targets_move_by_the_share_and_at_the_interval_asked_for() -> None:
+def test_targets_move_by_the_share_and_at_the_interval_asked_for():
     learner = make_learner(polyak=0.75, target_update_interval=3)
     start = copy.deepcopy(learner.target_critic.state_dict())
     for _ in range(2):
@@ -111,7 +110,7 @@ def test_targets_move_by_the_share_and_at_the_interval_asked_for() -> None:
         torch.testing.assert_close(value, expected)
 
 
-def test_a_delayed_actor_learns_at_every_third_update_of_the_critic() -> None:
+def test_a_delayed_actor_learns_at_every_third_update_of_the_critic():
     learner = make_learner(policy_delay=3)
     moved = []
     for _ in range(6):
@@ -125,7 +124,7 @@ def test_a_delayed_actor_learns_at_every_third_update_of_the_critic() -> None:
     assert moved == [True, False, False, True, False, False]
 
 
-def test_the_actor_update_leaves_the_critic_alone_and_normalizers_untouched() -> None:
+def test_the_actor_update_leaves_the_critic_alone_and_normalizers_untouched():
     learner = make_learner(learning_rate=0.0)
     learner.actor_optimizer.param_groups[0]['lr'] = 0.1
     critic = copy.deepcopy(learner.critic.state_dict())
@@ -145,7 +144,7 @@ def test_the_actor_update_leaves_the_critic_alone_and_normalizers_untouched() ->
         pytest.param(True, 'bfloat16', marks=pytest.mark.release),
     ],
 )
-def test_it_finds_the_best_action(layer_norm: bool, precision: str) -> None:
+def test_it_finds_the_best_action(layer_norm, precision):
     """Reward -|a - g|^2 without a future: the best action is the goal itself."""
     learner = make_learner(
         layer_norm, precision=precision, gamma=0.0, action_l2=0.0, learning_rate=3e-3
@@ -163,7 +162,7 @@ def test_it_finds_the_best_action(layer_norm: bool, precision: str) -> None:
     assert np.abs(action - goal).mean() < 0.2
 
 
-def test_action_l2_keeps_actions_small() -> None:
+def test_action_l2_keeps_actions_small():
     sizes = []
     for weight in (0.0, 10.0):
         learner = make_learner(action_l2=weight, learning_rate=3e-3)
@@ -175,7 +174,7 @@ def test_action_l2_keeps_actions_small() -> None:
     assert sizes[1] < 0.1 < sizes[0]
 
 
-def test_the_averaged_actor_keeps_its_share_and_takes_the_rest_of_the_actor() -> None:
+def test_the_averaged_actor_keeps_its_share_and_takes_the_rest_of_the_actor():
     config = recipe_config('FetchReach', 'paper', actor_average=0.9)
     learner = make_ddpg(NetworkShape(3, 2, 4, (8,)), config, CPU, Workers())
     old = copy.deepcopy(learner.actor.network.state_dict())
@@ -189,7 +188,7 @@ def test_the_averaged_actor_keeps_its_share_and_takes_the_rest_of_the_actor() ->
             torch.testing.assert_close(acting.network.state_dict()[name], value + 1.0)
 
 
-def test_learning_rates_fall_linearly_to_the_share_asked_for() -> None:
+def test_learning_rates_fall_linearly_to_the_share_asked_for():
     learner = make_learner(learning_rate=2e-3, final_learning_rate=0.1)
     for progress, expected in ((0.0, 2e-3), (0.5, 1.1e-3), (1.0, 2e-4), (1.5, 2e-4)):
         learner.set_progress(progress)
@@ -198,7 +197,7 @@ def test_learning_rates_fall_linearly_to_the_share_asked_for() -> None:
 
 
 @pytest.mark.parametrize('name', ['bellman', 'uncertain'])
-def test_goals_are_judged_as_precisely_as_values_are_learnt(name: str) -> None:
+def test_goals_are_judged_as_precisely_as_values_are_learnt(name):
     """In bfloat16, where updates are: it takes half of the time."""
     judged = {}
     for precision in ('float32', 'bfloat16'):
@@ -209,7 +208,7 @@ def test_goals_are_judged_as_precisely_as_values_are_learnt(name: str) -> None:
     np.testing.assert_allclose(judged['bfloat16'], judged['float32'], atol=0.02)
 
 
-def test_under_bfloat16_the_output_layer_stays_float32() -> None:
+def test_under_bfloat16_the_output_layer_stays_float32():
     network = MLP(4, 1, SHAPE)
     with torch.no_grad():
         network.output.bias.fill_(-49.9)
@@ -221,7 +220,7 @@ def test_under_bfloat16_the_output_layer_stays_float32() -> None:
     np.testing.assert_allclose(value.detach(), -49.9, atol=0.02)
 
 
-def test_precision_and_device_choices() -> None:
+def test_precision_and_device_choices():
     assert uses_bfloat16('bfloat16', CPU) and not uses_bfloat16('float32', CPU)
     assert choose_device('cpu') == CPU
     if not torch.cuda.is_available():

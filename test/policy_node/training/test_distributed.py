@@ -42,7 +42,7 @@ leave_workers(workers)
 
 
 @pytest.mark.release
-def test_two_workers_agree() -> None:
+def test_two_workers_agree():
     command = [sys.executable, '-m', 'torch.distributed.run', '--nproc-per-node', '2']
     command += ['--rdzv-backend', 'c10d', '--rdzv-endpoint', 'localhost:0', '--no-python']
     command += [sys.executable, '-c', PROGRAM]
@@ -51,7 +51,7 @@ def test_two_workers_agree() -> None:
     assert result.returncode == 0, result.stderr
 
 
-def test_a_single_process_is_alone() -> None:
+def test_a_single_process_is_alone():
     assert join_workers(torch.device('cpu')) == Workers()
     gradients = [torch.tensor([1.0, 2.0])]
     Workers().average_gradients(gradients)

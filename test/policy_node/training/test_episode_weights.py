@@ -16,7 +16,7 @@ PEN = task_spec('HandManipulatePenRotate')
 TICKS = 10
 
 
-def episodes_of(achieved: np.ndarray) -> Episodes:
+def episodes_of(achieved):
     """Episodes with these achieved goals (episodes, T + 1, goal size)."""
     achieved = np.asarray(achieved, np.float32)
     count, states, _ = achieved.shape
@@ -25,14 +25,14 @@ def episodes_of(achieved: np.ndarray) -> Episodes:
     )
 
 
-def poses(heights: np.ndarray) -> np.ndarray:
+def poses(heights):
     """Poses (episodes, T + 1, 7) at these heights, not turned."""
     achieved = np.zeros((*heights.shape, 7))
     achieved[..., 2], achieved[..., 3] = heights, 1.0
     return achieved
 
 
-def test_ticks_count_until_some_after_the_drop() -> None:
+def test_ticks_count_until_some_after_the_drop():
     heights = np.full((4, TICKS + 1), 0.2)
     heights[1, 4:] = 0.03
     heights[2, 10:] = 0.03
@@ -45,7 +45,7 @@ def test_ticks_count_until_some_after_the_drop() -> None:
     assert ticks_until_dropped(task_spec('FetchPush'), 3) is None
 
 
-def test_every_valid_transition_is_as_likely_as_any_other() -> None:
+def test_every_valid_transition_is_as_likely_as_any_other():
     heights = np.full((3, TICKS + 1), 0.2)
     heights[0, 2:] = 0.0
     replay = EpisodeReplay(8, TICKS, 7, 7, 1, count_ticks=ticks_until_dropped(PEN, 0))
@@ -54,8 +54,8 @@ def test_every_valid_transition_is_as_likely_as_any_other() -> None:
     assert np.bincount(row) / 22_000 == pytest.approx([2 / 22, 10 / 22, 10 / 22], abs=0.012)
 
 
-def test_weights_decide_their_share_of_a_draw() -> None:
-    def weigh(episodes: Episodes) -> np.ndarray:
+def test_weights_decide_their_share_of_a_draw():
+    def weigh(episodes):
         return episodes.achieved_goal[:, 0, 0].astype(float)
 
     replay, generator = EpisodeReplay(4, TICKS, 3, 3, 1, weigh=weigh), np.random.default_rng(0)
@@ -70,7 +70,7 @@ def test_weights_decide_their_share_of_a_draw() -> None:
     assert drawn == pytest.approx([1 / 8, 1 / 4, 1 / 2, 1 / 8], abs=0.012)
 
 
-def pen_episodes(achieved: np.ndarray) -> Episodes:
+def pen_episodes(achieved):
     """Episodes of these poses, seen as they are; the first value observed is the tick."""
     count = len(achieved)
     observation = np.zeros((count, PEN.episode_ticks + 1, PEN.observation_size))
@@ -82,7 +82,7 @@ def pen_episodes(achieved: np.ndarray) -> Episodes:
     )
 
 
-def test_a_batch_follows_the_configuration() -> None:
+def test_a_batch_follows_the_configuration():
     """A batch has only the one episode that was lifted, and only until its drop."""
     changes = {'moved_share': 1.0, 'ticks_after_drop': 1}
     config = recipe_config(
@@ -105,14 +105,14 @@ def test_a_batch_follows_the_configuration() -> None:
     assert has_moved(episodes).tolist() == [0.0, 1.0, 0.0]
 
 
-def sideways(achieved: np.ndarray, goal: np.ndarray) -> np.ndarray:
+def sideways(achieved, goal):
     """-1 until the goal is met along y, then 0."""
     return -1.0 * (np.abs(achieved - goal)[..., 1] > 0.5)
 
 
 @pytest.mark.parametrize('source', ['real', 'future'])
 @pytest.mark.parametrize('n_step', [1, 3])
-def test_a_drop_that_is_lost_is_worth_minus_one_for_ever(n_step: int, source: str) -> None:
+def test_a_drop_that_is_lost_is_worth_minus_one_for_ever(n_step, source):
     """Episode 0 drops its pen at tick 20, episode 1 never; rewards are -1 but at tick 5.
 
     With goals in hindsight, but at the tick that the goal is of: that of the loss perhaps.
@@ -148,6 +148,6 @@ def test_a_drop_that_is_lost_is_worth_minus_one_for_ever(n_step: int, source: st
 
 
 @pytest.mark.parametrize('changes', [{}, {'ticks_after_drop': 2, 'reward_type': 'dense'}])
-def test_a_loss_needs_a_drop_and_sparse_rewards(changes: dict[str, object]) -> None:
+def test_a_loss_needs_a_drop_and_sparse_rewards(changes):
     with pytest.raises(ValueError, match=r'drop_is_lost .*(ticks_after_drop|reward_type sparse)'):
         recipe_config('HandManipulatePenRotate', 'best', drop_is_lost=True, **changes)

@@ -24,7 +24,7 @@ COUNT, TICKS = 6, 10
 
 
 @pytest.fixture
-def episodes() -> Episodes:
+def episodes():
     """Achieved goals are (episode, state), desired goals (100 + episode, 0)."""
     row, state = np.meshgrid(np.arange(COUNT), np.arange(TICKS + 1), indexing='ij')
     achieved = np.stack([row, state], axis=-1).astype(np.float32)
@@ -33,19 +33,13 @@ def episodes() -> Episodes:
     return Episodes(np.concatenate([achieved, achieved], axis=-1), achieved, desired, action)
 
 
-def relabelled(
-    episodes: Episodes,
-    row: np.ndarray,
-    tick: np.ndarray,
-    mixture: dict[str, float],
-    generator: np.random.Generator,
-) -> np.ndarray:
+def relabelled(episodes, row, tick, mixture, generator):
     """Goals of transitions `tick` of episodes `row`, from sources drawn from a mixture."""
     source = draw_sources(mixture, len(row), generator)
     return goals_of(Starts(episodes, row, tick), source, list(mixture), generator)
 
 
-def draw(episodes: Episodes, strategy: str, k: int = 4) -> tuple[np.ndarray, ...]:
+def draw(episodes, strategy, k=4):
     generator = np.random.default_rng(1)
     row = generator.integers(COUNT, size=20_000)
     tick = generator.integers(TICKS, size=20_000)
@@ -54,25 +48,25 @@ def draw(episodes: Episodes, strategy: str, k: int = 4) -> tuple[np.ndarray, ...
     return row, tick, goal, is_desired
 
 
-def test_an_unknown_strategy_is_refused() -> None:
+def test_an_unknown_strategy_is_refused():
     message = "strategy 'real'; allowed: none, futureactual, future, final, episode, random$"
     with pytest.raises(ValueError, match=message):
         goal_mixture('real')
 
 
-def test_none_keeps_every_goal(episodes: Episodes) -> None:
+def test_none_keeps_every_goal(episodes):
     row, _, goal, _ = draw(episodes, 'none')
     assert (goal == episodes.desired_goal[row]).all()
 
 
 @pytest.mark.parametrize('strategy', ['future', 'final', 'episode', 'random'])
-def test_the_share_of_relabelled_goals_is_k_of_k_plus_1(episodes: Episodes, strategy: str) -> None:
+def test_the_share_of_relabelled_goals_is_k_of_k_plus_1(episodes, strategy):
     row, _, goal, is_desired = draw(episodes, strategy, k=4)
     assert is_desired.mean() == pytest.approx(0.2, abs=0.01)
     assert (goal[is_desired] == episodes.desired_goal[row[is_desired]]).all()
 
 
-def test_future_goals_come_later_in_the_same_episode(episodes: Episodes) -> None:
+def test_future_goals_come_later_in_the_same_episode(episodes):
     row, tick, goal, is_desired = draw(episodes, 'future')
     row, tick, goal = row[~is_desired], tick[~is_desired], goal[~is_desired]
     assert (goal[:, 0] == row).all()
@@ -83,27 +77,27 @@ def test_future_goals_come_later_in_the_same_episode(episodes: Episodes) -> None
         assert seen.mean() == pytest.approx((start + 1 + TICKS) / 2, abs=0.25)
 
 
-def test_final_goals_are_the_last_of_the_same_episode(episodes: Episodes) -> None:
+def test_final_goals_are_the_last_of_the_same_episode(episodes):
     row, _, goal, is_desired = draw(episodes, 'final')
     assert (goal[~is_desired, 0] == row[~is_desired]).all()
     assert (goal[~is_desired, 1] == TICKS).all()
 
 
-def test_episode_goals_are_any_of_the_same_episode(episodes: Episodes) -> None:
+def test_episode_goals_are_any_of_the_same_episode(episodes):
     row, tick, goal, is_desired = draw(episodes, 'episode')
     assert (goal[~is_desired, 0] == row[~is_desired]).all()
     assert set(goal[~is_desired, 1].tolist()) == set(range(1, TICKS + 1))
     assert (goal[~is_desired, 1] <= tick[~is_desired]).any()
 
 
-def test_random_goals_are_achieved_anywhere_in_the_replay(episodes: Episodes) -> None:
+def test_random_goals_are_achieved_anywhere_in_the_replay(episodes):
     row, _, goal, is_desired = draw(episodes, 'random')
     same = (goal[~is_desired, 0] == row[~is_desired]).mean()
     assert same == pytest.approx(1 / COUNT, abs=0.02)
     assert set(goal[~is_desired, 1].tolist()) == set(range(1, TICKS + 1))
 
 
-def test_futureactual_mixes_future_with_desired_goals_of_any_episode(episodes: Episodes) -> None:
+def test_futureactual_mixes_future_with_desired_goals_of_any_episode(episodes):
     row, tick, goal, is_desired = draw(episodes, 'futureactual')
     assert is_desired.mean() == pytest.approx(0.6, abs=0.015)
     assert (goal[~is_desired, 0] == row[~is_desired]).all()
@@ -112,9 +106,7 @@ def test_futureactual_mixes_future_with_desired_goals_of_any_episode(episodes: E
     assert own == pytest.approx(1 / 3 + 2 / 3 / COUNT, abs=0.02)
 
 
-def test_displaced_goals_are_near_the_state_and_know_nothing_of_the_step(
-    episodes: Episodes,
-) -> None:
+def test_displaced_goals_are_near_the_state_and_know_nothing_of_the_step(episodes):
     generator = np.random.default_rng(2)
     row, tick = (generator.integers(limit, size=5_000) for limit in (COUNT, TICKS))
     goal = relabelled(episodes, row, tick, {'displaced': 1.0}, generator)
@@ -131,7 +123,7 @@ def test_displaced_goals_are_near_the_state_and_know_nothing_of_the_step(
     assert (drawn[0] == drawn[1]).all(axis=1).mean() > 1 - 1 / COUNT
 
 
-def test_no_displacement_is_taken_from_after_an_end(episodes: Episodes) -> None:
+def test_no_displacement_is_taken_from_after_an_end(episodes):
     """Such as that of an object which falls."""
     valid = np.array([1, 2, 3, 4, 5, TICKS])
     achieved = episodes.achieved_goal.copy()
@@ -145,7 +137,7 @@ def test_no_displacement_is_taken_from_after_an_end(episodes: Episodes) -> None:
     assert set(goal[:, 1].tolist()) == {float(span) for span in range(1, TICKS + 1)}
 
 
-def test_displaced_poses_are_turned_as_another_episode_turned() -> None:
+def test_displaced_poses_are_turned_as_another_episode_turned():
     angle = np.linspace(0.0, 1.0, TICKS + 1)
     axes = np.eye(3)[:COUNT]
     poses = np.zeros((3, TICKS + 1, 7))
@@ -172,7 +164,7 @@ def test_displaced_poses_are_turned_as_another_episode_turned() -> None:
         ('real=.5, random=.25', {'real': 0.75, 'random': 0.25}),
     ],
 )
-def test_goal_sources_can_be_mixed(text: str, mixture: dict[str, float]) -> None:
+def test_goal_sources_can_be_mixed(text, mixture):
     assert complete_mixture(parse_value('goals', text)) == pytest.approx(mixture)
 
 
@@ -187,12 +179,12 @@ def test_goal_sources_can_be_mixed(text: str, mixture: dict[str, float]) -> None
         ('future=nan', 'add up to at most 1'),
     ],
 )
-def test_a_bad_mixture_is_refused(text: str, message: str) -> None:
+def test_a_bad_mixture_is_refused(text, message):
     with pytest.raises(ValueError, match=re.escape(message)):
         recipe_config('FetchReach', 'best', goals=text)
 
 
-def numbered(count: int, ticks: int) -> Episodes:
+def numbered(count, ticks):
     """Achieved goals are (episode, state)."""
     row, state = np.meshgrid(np.arange(count), np.arange(ticks + 1), indexing='ij')
     achieved = np.stack([row, state], axis=-1).astype(np.float32)
@@ -200,7 +192,7 @@ def numbered(count: int, ticks: int) -> Episodes:
 
 
 @pytest.mark.parametrize('source', ['future', 'final', 'episode', 'random'])
-def test_nothing_is_drawn_from_after_the_last_valid_tick(source: str) -> None:
+def test_nothing_is_drawn_from_after_the_last_valid_tick(source):
     """Neither transitions nor goals: episode 0 is worth 5 ticks, 1 is worth 20, 2 all 40."""
     episodes, valid = numbered(3, 40), np.array([5, 20, 40])
     generator = np.random.default_rng(2)
@@ -216,8 +208,8 @@ def test_nothing_is_drawn_from_after_the_last_valid_tick(source: str) -> None:
         assert (batch.goal[:, 1] == valid[row]).all()
 
 
-def test_batches_are_consistent_transitions_with_recomputed_rewards(episodes: Episodes) -> None:
-    def reward(achieved: np.ndarray, desired: np.ndarray) -> np.ndarray:
+def test_batches_are_consistent_transitions_with_recomputed_rewards(episodes):
+    def reward(achieved, desired):
         assert achieved.dtype == desired.dtype == np.float64
         return -(np.abs(achieved - desired).sum(axis=-1) > 0).astype(np.float64)
 

@@ -2,27 +2,24 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
 
 from policy_node.policies.network_shape import NetworkShape
-from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.flat import to_flat
 from policy_node.training.configuration.recipes import recipe_config
 from policy_node.training.experience.replay import Transitions
 from policy_node.training.learners.imagined import ImaginingDDPG
 from policy_node.training.machine import Workers
-from policy_node.training.runs.trainer import Trainer
+from support.runs import resumed, same, trained
 
 torch.set_num_threads(1)
 
 SHAPE = NetworkShape(10, 3, 4, (64, 64))
 
 
-def configured(**changes: object) -> TrainConfig:
+def configured(**changes):
     quick = {'precision': 'float32', 'action_l2': 0.0, 'goal_features': 'plain'}
     return recipe_config('FetchReach', 'best', **{**quick, 'subgoal_prior': 1.0, **changes})
 
@@ -30,17 +27,17 @@ def configured(**changes: object) -> TrainConfig:
 class Distance(torch.nn.Module):
     """Ticks to the goal at so many per unit of distance, whatever the action: the true value."""
 
-    def __init__(self, per_unit: float) -> None:
+    def __init__(self, per_unit):
         super().__init__()
         self.per_unit = per_unit
         self.unused = torch.nn.Parameter(torch.zeros(()))
 
-    def forward(self, features: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
+    def forward(self, features, action):
         distance = (features[:, :3] - features[:, -3:]).norm(dim=-1)
         return -self.per_unit * distance + self.unused + 0.0 * action.sum(dim=-1)
 
 
-def learner_of(**changes: object) -> ImaginingDDPG:
+def learner_of(**changes):
     """One whose critic knows the values."""
     torch.manual_seed(0)
     learner = ImaginingDDPG(SHAPE, configured(**changes), torch.device('cpu'), Workers())
@@ -50,7 +47,7 @@ def learner_of(**changes: object) -> ImaginingDDPG:
     return learner
 
 
-def on_a_line(generator: np.random.Generator, count: int) -> Transitions:
+def on_a_line(generator, count):
     """States and goals anywhere from -1 to 1 along the first axis."""
     state, goal = np.zeros((count, 10), np.float32), np.zeros((count, 3), np.float32)
     state[:, 0], goal[:, 0] = generator.uniform(-1, 1, (2, count))
@@ -59,7 +56,7 @@ def on_a_line(generator: np.random.Generator, count: int) -> Transitions:
 
 
 @pytest.mark.release
-def test_what_is_imagined_lies_halfway_by_value() -> None:
+def test_what_is_imagined_lies_halfway_by_value():
     learner, generator = learner_of(learning_rate=3e-3), np.random.default_rng(0)
     for _ in range(400):
         learner.update(on_a_line(generator, 512))
@@ -72,13 +69,13 @@ def test_what_is_imagined_lies_halfway_by_value() -> None:
     assert np.abs(imagined[:, 1:]).max() < 0.1
 
 
-def test_the_actor_is_drawn_to_what_it_does_for_the_subgoal() -> None:
+def test_the_actor_is_drawn_to_what_it_does_for_the_subgoal():
     """Values here say nothing of actions, so the prior alone moves the actor."""
     learner, generator = learner_of(subgoal_prior=5.0), np.random.default_rng(0)
     batch = on_a_line(generator, 512)
     known = learner.tensors(batch)
 
-    def distance() -> float:
+    def distance():
         with torch.no_grad():
             subgoal = learner.imagine(known.features)
             prior = learner.act(batch.observation, subgoal.numpy())
@@ -95,7 +92,7 @@ def test_the_actor_is_drawn_to_what_it_does_for_the_subgoal() -> None:
     assert distance() < 0.1 * before
 
 
-def test_the_network_that_imagines_learns_at_its_interval() -> None:
+def test_the_network_that_imagines_learns_at_its_interval():
     changes = {'subgoal_prior': 0.3, 'imagination_interval': 3}
     learner, batch = learner_of(**changes), on_a_line(np.random.default_rng(0), 64)
     learnt = []
@@ -108,18 +105,10 @@ def test_the_network_that_imagines_learns_at_its_interval() -> None:
 
 
 @pytest.mark.release
-def test_a_run_goes_on_where_it_stopped(tmp_path: Path) -> None:
-    small = {'num_envs': 8, 'updates_per_cycle': 4, 'batch_size': 64, 'evaluation_episodes': 8}
-    small |= {'simulation_threads': 1, 'torch_threads': 1, 'subgoal_prior': 0.3}
-    first = Trainer(
-        recipe_config('FetchReach', 'best', total_steps=800, **small), tmp_path, Workers()
-    )
-    first.train()
-    config = recipe_config('FetchReach', 'best', total_steps=1_200, **small)
-    again = Trainer(config, tmp_path, Workers())
-    again.resume(tmp_path / 'training_state.safetensors')
-    for name, value in first.learner.modules()['imagination'].state_dict().items():
-        assert torch.equal(value, again.learner.modules()['imagination'].state_dict()[name])
+def test_a_run_goes_on_where_it_stopped(tmp_path):
+    first = trained(tmp_path, total_steps=800, subgoal_prior=0.3)
+    again = resumed(tmp_path, total_steps=1_200, subgoal_prior=0.3)
+    assert same(*(each.learner.modules()['imagination'].state_dict() for each in (first, again)))
     assert again.train() == '1,200 environment steps done'
 
 
@@ -132,7 +121,5 @@ def test_a_run_goes_on_where_it_stopped(tmp_path: Path) -> None:
         ('FetchPush', {}, 0.0),
     ],
 )
-def test_best_imagines_where_it_pays_and_nothing_else_is_asked_for(
-    task: str, changes: dict[str, object], prior: float
-) -> None:
+def test_best_imagines_where_it_pays_and_nothing_else_is_asked_for(task, changes, prior):
     assert to_flat(recipe_config(task, 'best', **changes))['subgoal_prior'] == prior

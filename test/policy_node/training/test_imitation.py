@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
@@ -22,7 +20,7 @@ torch.set_num_threads(1)
 LATE = '{"action": {"latency": 1}}'
 
 
-def test_each_input_is_answered_in_the_state_in_which_the_action_arrives(tmp_path: Path) -> None:
+def test_each_input_is_answered_in_the_state_in_which_the_action_arrives(tmp_path):
     task = 'FetchPush'
     config = recipe_config(task, 'robust', num_envs=2, disturbances=LATE)
     networks = read_initial_networks(task).fitted(config)
@@ -39,7 +37,7 @@ def test_each_input_is_answered_in_the_state_in_which_the_action_arrives(tmp_pat
     assert not torch.allclose(answers[:-2], expected[:-2], rtol=1e-3, atol=1e-3)
 
 
-def test_successive_cycles_scale_the_disturbances(tmp_path: Path) -> None:
+def test_successive_cycles_scale_the_disturbances(tmp_path):
     config = recipe_config(
         'FetchPush', 'robust', num_envs=2, disturbances=LATE, disturbance_scales=(0.0, 1.0)
     )
@@ -50,7 +48,7 @@ def test_successive_cycles_scale_the_disturbances(tmp_path: Path) -> None:
         assert trainer._answers._count == stored
 
 
-def test_the_critic_of_the_imitated_policy_judges_the_actions(tmp_path: Path) -> None:
+def test_the_critic_of_the_imitated_policy_judges_the_actions(tmp_path):
     task = 'FetchSlide'
     config = recipe_config(task, 'robust', num_envs=2, value_weight=1.0, updates_per_cycle=5)
     networks = read_initial_networks(task).fitted(config)
@@ -65,7 +63,7 @@ def test_the_critic_of_the_imitated_policy_judges_the_actions(tmp_path: Path) ->
     assert not torch.equal(before, trainer.actor(states))
 
 
-def test_the_newest_answers_are_kept() -> None:
+def test_the_newest_answers_are_kept():
     answers = Answers(3, (1, 1, 1))
     for value in range(5):
         answers.add(*(torch.full((1, 1), factor * value) for factor in (1.0, 10.0, -1.0)))
@@ -74,7 +72,7 @@ def test_the_newest_answers_are_kept() -> None:
     assert torch.equal(states, 10.0 * inputs) and torch.equal(outputs, -inputs)
 
 
-def test_a_run_writes_a_policy_with_past_actions(tmp_path: Path) -> None:
+def test_a_run_writes_a_policy_with_past_actions(tmp_path):
     run = tmp_path / 'run'
     arguments = ['--task', 'FetchReach', '--recipe', 'robust', '--steps', '6400']
     small = ['--set', 'updates_per_cycle=10', '--set', 'evaluation_episodes=64']
@@ -101,9 +99,7 @@ def test_a_run_writes_a_policy_with_past_actions(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_a_setting_that_does_not_fit_is_one_line(
-    options: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_setting_that_does_not_fit_is_one_line(options, said, tmp_path, capsys):
     assert main(['--task', 'FetchReach', *options, '--output', str(tmp_path / 'run')]) == 2
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 1 and said in lines[0]

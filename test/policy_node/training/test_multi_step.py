@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 
 from fetch_hand_sim.simulation.rewards import GoalMetric
 from msgs_spec.tasks import task_spec
-from policy_node.training.experience.replay import Episodes, Transitions
+from policy_node.training.experience.replay import Episodes
 from policy_node.training.experience.sampling import TransitionSampler
 from policy_node.training.research.conditions import ConditionedSampler, Threshold
 from policy_node.training.research.frequent_actions import HoldingSampler, length_of
@@ -25,7 +23,7 @@ HELD = np.random.default_rng(1).integers(1, LONGEST + 1, (COUNT, TICKS))
 
 
 @pytest.fixture
-def episodes() -> Episodes:
+def episodes():
     """Random walks of some centimetres a tick; what is observed are the episode and the tick."""
     generator = np.random.default_rng(0)
     row, tick = np.meshgrid(np.arange(COUNT), np.arange(TICKS + 1), indexing='ij')
@@ -38,20 +36,16 @@ def episodes() -> Episodes:
     return Episodes(*(values.astype(np.float32) for values in arrays))
 
 
-def nearness(achieved: np.ndarray, goal: np.ndarray) -> np.ndarray:
+def nearness(achieved, goal):
     """A reward that no two places and no two goals share."""
     return -np.linalg.norm(achieved - goal, axis=-1)
 
 
-def steps_of(batch: Transitions) -> np.ndarray:
+def steps_of(batch):
     return (batch.next_observation - batch.observation)[:, 1].astype(int)
 
 
-def assert_rewards_are_those_of_a_loop(
-    episodes: Episodes,
-    batch: Transitions,
-    reward_of: Callable[[int, np.ndarray, np.ndarray], float],
-) -> None:
+def assert_rewards_are_those_of_a_loop(episodes, batch, reward_of):
     """What each step achieves is rewarded for the goal of the row, and discounted by 0.9 a step."""
     expected = []
     for index, steps in enumerate(steps_of(batch)):
@@ -69,7 +63,7 @@ def assert_rewards_are_those_of_a_loop(
 class Judge:
     """Would do what was done in every other episode, and the opposite in the others."""
 
-    def act(self, observation: np.ndarray, goal: np.ndarray) -> np.ndarray:
+    def act(self, observation, goal):
         return np.repeat(observation[:, :1] % 2, 5, axis=1)
 
 
@@ -86,9 +80,7 @@ class Judge:
     ],
     ids=['2', '5', '100', 'lambda', 'cut', 'held'],
 )
-def test_every_step_of_a_return_is_rewarded_for_the_goal_of_its_row(
-    episodes: Episodes, sampler: TransitionSampler, valid: np.ndarray | None
-) -> None:
+def test_every_step_of_a_return_is_rewarded_for_the_goal_of_its_row(episodes, sampler, valid):
     generator = np.random.default_rng(2)
     batch = sampler.sample(episodes, ROW, MIXTURE, generator, valid)
     assert_rewards_are_those_of_a_loop(episodes, batch, lambda _, *goals: nearness(*goals))
@@ -101,16 +93,14 @@ def test_every_step_of_a_return_is_rewarded_for_the_goal_of_its_row(
         np.testing.assert_array_equal(steps, np.minimum(sampler.most_steps, left))
 
 
-def test_a_reward_for_a_share_of_time_is_that_share_at_every_step(episodes: Episodes) -> None:
+def test_a_reward_for_a_share_of_time_is_that_share_at_every_step(episodes):
     sampler = TransitionSampler(nearness, 0.9, 3, reward_scale=0.1)
     batch = sampler.sample(episodes, ROW, MIXTURE, np.random.default_rng(2))
     assert_rewards_are_those_of_a_loop(episodes, batch, lambda _, *goals: 0.1 * nearness(*goals))
 
 
 @pytest.mark.parametrize('every', [2, 4, TICKS])
-def test_every_tick_of_a_subgoal_is_rewarded_for_the_goal_of_its_row(
-    episodes: Episodes, every: int
-) -> None:
+def test_every_tick_of_a_subgoal_is_rewarded_for_the_goal_of_its_row(episodes, every):
     sampler = SubgoalSampler(TransitionSampler(nearness, 0.9), every, missed_value=-50.0)
     episodes.action[..., 4] = 0.0
     batch = sampler.sample(episodes, ROW, MIXTURE, np.random.default_rng(2))
@@ -119,9 +109,7 @@ def test_every_tick_of_a_subgoal_is_rewarded_for_the_goal_of_its_row(
 
 
 @pytest.mark.parametrize('n_step', [1, 3, 100])
-def test_the_threshold_of_a_row_holds_at_every_step_of_its_return(
-    episodes: Episodes, n_step: int
-) -> None:
+def test_the_threshold_of_a_row_holds_at_every_step_of_its_return(episodes, n_step):
     spec = task_spec('FetchReach')
     condition = Threshold(GoalMetric(spec), widest=4.0)
     sampler = ConditionedSampler(nearness, 0.9, n_step, condition=condition)
@@ -129,7 +117,7 @@ def test_the_threshold_of_a_row_holds_at_every_step_of_its_return(
     near = spec.distance_threshold * np.exp(batch.condition[:, 0].astype(float))
     assert 0.02 < near.min() < 0.03 and 0.15 < near.max() < 0.2
 
-    def met(index: int, achieved: np.ndarray, goal: np.ndarray) -> float:
+    def met(index, achieved, goal):
         return float(np.linalg.norm(achieved - goal) < near[index]) - 1.0
 
     assert_rewards_are_those_of_a_loop(episodes, batch, met)

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-import torch
 
 from policy_node.policies.actor import Normalizer
 from policy_node.training.experience.experience import RunningStatistics
 from policy_node.training.machine import Workers
+from support.runs import same
 
 
-def test_statistics_over_parts_are_those_of_everything() -> None:
+def test_statistics_over_parts_are_those_of_everything():
     generator = np.random.default_rng(0)
     values = generator.normal([3.0, -2.0], [0.5, 4.0], size=(40, 25, 2))
     statistics, normalizer = RunningStatistics(2), Normalizer(2)
@@ -22,7 +22,7 @@ def test_statistics_over_parts_are_those_of_everything() -> None:
     np.testing.assert_allclose(normalizer.std, flat.std(axis=0), rtol=1e-5)
 
 
-def test_std_has_a_floor_and_values_a_ceiling() -> None:
+def test_std_has_a_floor_and_values_a_ceiling():
     statistics, normalizer = RunningStatistics(2), Normalizer(2)
     statistics.update([[7.0, 1e6], [7.0, 1e6]], Workers())
     statistics.write(normalizer)
@@ -30,17 +30,17 @@ def test_std_has_a_floor_and_values_a_ceiling() -> None:
     np.testing.assert_allclose(normalizer.std, 0.01)
 
 
-def test_nothing_seen_changes_nothing() -> None:
+def test_nothing_seen_changes_nothing():
     statistics, normalizer = RunningStatistics(3), Normalizer(3)
     statistics.update(np.zeros((0, 3)), Workers())
     statistics.write(normalizer)
     assert normalizer.std.tolist() == [1.0, 1.0, 1.0]
 
 
-def test_state_continues() -> None:
+def test_state_continues():
     first, second = RunningStatistics(1), RunningStatistics(1)
     first.update([[1.0], [2.0]], Workers())
-    second.load_state({name: value.clone() for name, value in first.state().items()})
+    second.load_state_dict(first.state_dict())
     for statistics in (first, second):
         statistics.update([[6.0]], Workers())
-    assert all(torch.equal(first.state()[k], second.state()[k]) for k in first.state())
+    assert same(first.state_dict(), second.state_dict())

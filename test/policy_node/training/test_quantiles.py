@@ -13,7 +13,7 @@ from support.learners import make_learner
 torch.set_num_threads(1)
 
 
-def lottery(count: int, generator: np.random.Generator) -> Transitions:
+def lottery(count, generator):
     """One state, one step: the return is -1 nine times of ten and else -9."""
     reward = np.where(generator.random(count) < 0.9, -1.0, -9.0).astype(np.float32)
     same = np.ones((count, 1), np.float32)
@@ -22,7 +22,7 @@ def lottery(count: int, generator: np.random.Generator) -> Transitions:
 
 
 @pytest.mark.release
-def test_the_quantiles_of_a_lottery_are_learnt_and_its_mean_with_them() -> None:
+def test_the_quantiles_of_a_lottery_are_learnt_and_its_mean_with_them():
     learner = make_learner(quantiles=5, gamma=0.95)
     generator = np.random.default_rng(0)
     for _ in range(1500):
@@ -38,14 +38,14 @@ def test_the_quantiles_of_a_lottery_are_learnt_and_its_mean_with_them() -> None:
     assert float(value) == float(found.mean())
 
 
-def test_truncated_targets_leave_out_the_highest_of_all_critics_together() -> None:
+def test_truncated_targets_leave_out_the_highest_of_all_critics_together():
     quantiles = torch.arange(50.0).reshape(2, 1, 25)
     assert sample_of(quantiles, truncated=False).shape == (1, 50)
     assert sample_of(quantiles, truncated=True)[0].tolist() == list(range(46))
     assert sample_of(torch.tensor([[3.0, 1.0, 2.0]]), truncated=True).tolist() == [[1.0, 2.0]]
 
 
-def test_the_cost_is_least_at_the_quantiles_of_the_target() -> None:
+def test_the_cost_is_least_at_the_quantiles_of_the_target():
     sample = torch.linspace(-20.0, 0.0, 1001)[None]
     best = torch.quantile(sample[0], levels(4, sample))[None]
     cost = quantile_costs(best, sample)

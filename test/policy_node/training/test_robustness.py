@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import pytest
 
@@ -16,7 +15,7 @@ FEW = ['--policy', 'resting', '--task', 'FetchReach', '--episodes', '2', '--thre
 
 
 @pytest.mark.parametrize('task', TASKS)
-def test_every_task_has_its_points(task: str) -> None:
+def test_every_task_has_its_points(task):
     found = list(points(task_spec(task)))
     assert found[0].disturbances.is_off
     assert not any(each.disturbances.is_off for each in found[1:])
@@ -24,7 +23,7 @@ def test_every_task_has_its_points(task: str) -> None:
     assert any('object' in each.name for each in found) == task_spec(task).has_object
 
 
-def test_success_is_kept_up_to_the_level_before_the_first_loss() -> None:
+def test_success_is_kept_up_to_the_level_before_the_first_loss():
     (latency,) = (each for each in SWEEPS if each.name == 'action latency')
     success = {f'action latency {level}': value for level, value in enumerate([1, 0.9, 0.7, 1], 1)}
     assert kept_up_to(latency, success, 1.0) == 2
@@ -32,7 +31,7 @@ def test_success_is_kept_up_to_the_level_before_the_first_loss() -> None:
     assert kept_up_to(latency, dict.fromkeys(success, 0.1), 1.0) is None
 
 
-def test_the_sentence_names_what_is_kept_and_what_is_lost() -> None:
+def test_the_sentence_names_what_is_kept_and_what_is_lost():
     success = {each.key: 1.0 for each in points(REACH)}
     success |= {'action latency 3': 0.5, 'joint noise 0.005': 0.0}
     text = sentence(REACH, 25.0, success)
@@ -40,9 +39,7 @@ def test_the_sentence_names_what_is_kept_and_what_is_lost() -> None:
 
 
 @pytest.mark.release
-def test_an_interrupted_command_goes_on_with_the_missing_points(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_interrupted_command_goes_on_with_the_missing_points(tmp_path, capsys):
     words, file = [*FEW, '--output', str(tmp_path / 'a.b')], tmp_path / 'a.b.json'
     assert main(words) == 0
     whole = json.loads(file.read_text())

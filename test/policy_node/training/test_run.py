@@ -12,9 +12,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,64 +20,52 @@ import torch
 
 from fetch_hand_sim.datasets.writing import alone_in
 from policy_node.policies import checkpoint
-from policy_node.policies.actor import Actor
 from policy_node.policies.files import read_tensors
-from policy_node.training.configuration.config import TrainConfig
-from policy_node.training.configuration.recipes import recipe_config
-from policy_node.training.evaluation import EpisodeOutcomes
 from policy_node.training.experience.episode_files import load_replay, save_replay
 from policy_node.training.experience.replay import EpisodeReplay
-from policy_node.training.machine import Workers
 from policy_node.training.runs.run import lock_run
 from policy_node.training.runs.run_log import read_progress
-from policy_node.training.runs.trainer import Trainer
 from policy_node.training.train_her import main
 from support.full_disk import files_at_most
+from support.runs import SMALL, STATE, one_line, options_of, resumed, trained, trainer_of
 
-torch.set_num_threads(1)
-
-SMALL = {'num_envs': 8, 'updates_per_cycle': 4, 'batch_size': 64, 'evaluation_episodes': 8}
-SMALL |= {'simulation_threads': 1, 'torch_threads': 1, 'evaluate_every': 1_000}
-SET = [f'--set={name}={value}' for name, value in SMALL.items()]
-STATE = 'training_state.safetensors'
-
-
-def small(**changes: object) -> TrainConfig:
-    return recipe_config('FetchReach', 'best', **{**SMALL, **changes})
+SET = options_of(**SMALL | {'evaluate_every': 1_000})
+REACH = ['--task', 'FetchReach', *SET]
 
 
 class StopAfter:
     """A log that stops the run after some cycles."""
 
-    def __init__(self, trainer: Trainer, cycles: int) -> None:
+    def __init__(self, trainer, cycles=1000):
         self.trainer, self.left, self.rows = trainer, cycles, []
 
-    def write(self, row: dict[str, float | None]) -> None:
+    def write(self, row):
         self.rows.append(row)
         self.left -= 1
         if self.left == 0:
             self.trainer.stop('interrupted')
 
 
-def train_in_parts(config: TrainConfig, output: Path, cycles: int) -> list[dict]:
+def train_in_parts(output, cycles, **fields):
     """Interrupts a run after every so many cycles and resumes it until it is done."""
-    rows: list[dict] = []
-    while True:
-        trainer = Trainer(config, output, Workers())
-        if (output / STATE).exists():
-            trainer.resume(output / STATE)
+    rows, reason = [], 'interrupted'
+    while reason == 'interrupted':
+        start = resumed if (output / STATE).exists() else trainer_of
+        trainer = start(output, evaluate_every=1_000, **fields)
         log = StopAfter(trainer, cycles)
         reason = trainer.train(log)
         rows += log.rows
-        if reason != 'interrupted':
-            return rows
+    return rows
+
+
+def counters_of(run):
+    return json.loads(read_tensors(run / STATE)[1]['counters'])
 
 
 @pytest.mark.release
-def test_a_run_interrupted_ten_times_learns_as_much_as_one_that_was_not(tmp_path: Path) -> None:
-    config = small(total_steps=4_400, evaluate_every=1_000)
-    whole = train_in_parts(config, tmp_path / 'whole', cycles=1000)
-    parts = train_in_parts(config, tmp_path / 'parts', cycles=1)
+def test_a_run_interrupted_ten_times_learns_as_much_as_one_that_was_not(tmp_path):
+    whole = train_in_parts(tmp_path / 'whole', 1000, total_steps=4_400)
+    parts = train_in_parts(tmp_path / 'parts', 1, total_steps=4_400)
     for name in ('env_steps', 'updates', 'episodes'):
         assert [row[name] for row in parts] == [row[name] for row in whole]
     assert parts[-1]['updates'] == 11 * 4
@@ -87,15 +73,12 @@ def test_a_run_interrupted_ten_times_learns_as_much_as_one_that_was_not(tmp_path
     assert len(evaluated) >= 3, 'although no part is as long as the time between evaluations'
 
 
-def test_a_run_without_its_replay_fills_it_up_before_it_goes_on(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_without_its_replay_fills_it_up_before_it_goes_on(tmp_path, capsys):
     """As runs from before replays were kept."""
-    Trainer(small(total_steps=2_000), tmp_path, Workers()).train()
+    trained(tmp_path, total_steps=2_000)
     (tmp_path / 'replay.safetensors').write_bytes(b'damaged')
-    trainer = Trainer(small(total_steps=2_400), tmp_path, Workers())
-    trainer.resume(tmp_path / STATE)
-    log = StopAfter(trainer, 100)
+    trainer = resumed(tmp_path, total_steps=2_400)
+    log = StopAfter(trainer)
     trainer.train(log)
     assert [(row['env_steps'], row['updates']) for row in log.rows] == [(2_400, 24)]
     assert trainer.experience.transitions == 2_000 + 400
@@ -108,49 +91,41 @@ def test_a_run_without_its_replay_fills_it_up_before_it_goes_on(
 
 @pytest.mark.release
 @pytest.mark.parametrize('damaged', [True, False])
-def test_a_replay_that_is_no_multiple_of_an_episode_is_full_with_whole_ones(
-    tmp_path: Path, damaged: bool
-) -> None:
+def test_a_replay_that_is_no_multiple_of_an_episode_is_full_with_whole_ones(tmp_path, damaged):
     """20 episodes of 50 steps go into 1,030 transitions."""
     held = {'replay_transitions': 1_030, 'learning_starts': 1_030}
-    Trainer(small(total_steps=2_000, **held), tmp_path, Workers()).train()
+    trained(tmp_path, total_steps=2_000, **held)
     if damaged:
         (tmp_path / 'replay.safetensors').write_bytes(b'damaged')
-    trainer = Trainer(small(total_steps=2_400, **held), tmp_path, Workers())
-    trainer.resume(tmp_path / STATE)
-    log = StopAfter(trainer, 100)
+    trainer = resumed(tmp_path, total_steps=2_400, **held)
+    log = StopAfter(trainer)
     trainer.train(log)
     # Learning began with the third cycle, when 1,000 transitions were there.
     assert [(row['env_steps'], row['updates']) for row in log.rows] == [(2_400, 16)]
 
 
-def test_a_best_actor_that_is_newer_than_the_checkpoint_stays(tmp_path: Path) -> None:
+def test_a_best_actor_that_is_newer_than_the_checkpoint_stays(tmp_path):
     """As after a kill between an evaluation and the next checkpoint."""
-    trainer = Trainer(small(total_steps=2_000), tmp_path, Workers())
-    trainer.train()
+    trainer = trained(tmp_path, total_steps=800)
     best = tmp_path / 'best.safetensors'
     actor, info = checkpoint.load(best)
     assert info.success['mean_return'] == pytest.approx(trainer.counters.best_return)
     great = {**info.success, 'last_step': 1.0, 'mean_return': -1.0}
     checkpoint.save(best, actor, replace(info, success=great))
     saved = best.read_bytes()
-    trainer = Trainer(small(total_steps=2_400), tmp_path, Workers())
-    trainer.resume(tmp_path / STATE)
+    trainer = resumed(tmp_path, total_steps=1_200)
     assert trainer.counters.best_success == 1.0
     trainer.train()
     assert best.read_bytes() == saved
 
 
-def test_a_finished_run_is_not_trained_any_further_but_with_more_steps(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_finished_run_is_not_trained_any_further_but_with_more_steps(tmp_path, capsys):
     run = tmp_path / 'run'
-    assert main(['--task', 'FetchReach', *SET, '--steps', '1200', '--output', str(run)]) == 0
+    assert main([*REACH, '--steps', '1200', '--output', str(run)]) == 0
     before = (run / STATE).read_bytes()
     assert main(['--resume', str(run)]) == 0
-    assert (
-        '1,200 environment steps done before; give another total_steps' in capsys.readouterr().out
-    )
+    said = capsys.readouterr().out
+    assert '1,200 environment steps done before; give another total_steps' in said
     assert (run / STATE).read_bytes() == before
     assert main(['--resume', str(run), '--steps', '2000']) == 0
     assert [row['updates'] for row in read_progress(run / 'progress.csv')] == [4, 8, 12, 16, 20]
@@ -163,22 +138,19 @@ def test_a_finished_run_is_not_trained_any_further_but_with_more_steps(
         ({'success_target': 0.5}, 'success target 0.5 reached before; give another success_target'),
     ],
 )
-def test_a_run_that_its_limits_ended_is_not_trained_any_further(
-    tmp_path: Path, limit: dict[str, object], message: str
-) -> None:
-    trainer = Trainer(small(**limit), tmp_path, Workers())
+def test_a_run_that_its_limits_ended_is_not_trained_any_further(tmp_path, limit, message):
+    trainer = trainer_of(tmp_path, **limit)
     trainer.counters.seconds, trainer.counters.best_success = 5.0, 0.5
     trainer.save()
     shutil.copy(tmp_path / 'latest.safetensors', tmp_path / 'best.safetensors')
-    again = Trainer(small(**limit), tmp_path, Workers())
-    again.resume(tmp_path / STATE)
+    again = resumed(tmp_path, **limit)
     assert again.train().startswith(message)
     assert again.counters.env_steps == 0
 
 
-def test_the_actor_that_a_run_ends_with_is_evaluated(tmp_path: Path) -> None:
-    trainer = Trainer(small(total_steps=2_000, evaluate_every=100_000), tmp_path, Workers())
-    log = StopAfter(trainer, 1000)
+def test_the_actor_that_a_run_ends_with_is_evaluated(tmp_path):
+    trainer = trainer_of(tmp_path, total_steps=2_000, evaluate_every=100_000)
+    log = StopAfter(trainer)
     trainer.train(log)
     evaluated = [row['env_steps'] for row in log.rows if row.get('eval_success') is not None]
     assert evaluated == [800, 2_000], 'after the first updates, and at the end'
@@ -186,52 +158,42 @@ def test_the_actor_that_a_run_ends_with_is_evaluated(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize('overlap', [True, pytest.param(False, marks=pytest.mark.release)])
-def test_the_last_evaluation_is_of_the_last_actor(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, overlap: bool
-) -> None:
+def test_the_last_evaluation_is_of_the_last_actor(tmp_path, monkeypatch, overlap):
     """With `overlap`, an evaluation due in the last cycle would run beside the learner."""
-    due = small(total_steps=2_000, evaluate_every=400, overlap=overlap)
-    trainer = Trainer(due, tmp_path, Workers())
+    trainer = trainer_of(tmp_path, total_steps=2_000, overlap=overlap)
     evaluated = []
     measure = trainer._evaluator.evaluate
 
-    def evaluate(actor: Actor, best_success: float) -> EpisodeOutcomes:
+    def evaluate(actor, best_success):
         evaluated.append(actor)
         return measure(actor, best_success)
 
     monkeypatch.setattr(trainer._evaluator, 'evaluate', evaluate)
-    log = StopAfter(trainer, 1000)
+    log = StopAfter(trainer)
     trainer.train(log)
     last, now = evaluated[-1].state_dict(), trainer.learner.evaluation_actor().state_dict()
     assert all(torch.equal(value, now[name]) for name, value in last.items())
     assert len(evaluated) == sum('eval_success' in row for row in log.rows) == 5 - overlap
 
 
-def test_a_run_that_goes_on_is_evaluated_as_often_as_it_now_should(tmp_path: Path) -> None:
-    trainer = Trainer(small(), tmp_path, Workers())
+def test_a_run_that_goes_on_is_evaluated_as_often_as_it_now_should(tmp_path):
+    trainer = trainer_of(tmp_path)
     trainer.counters.env_steps, trainer.counters.next_evaluation = 4_000, 4_800
     trainer.save()
     for evaluate_every, due in ((400, 4_400), (1_000, 4_800), (100_000, 4_800)):
-        trainer = Trainer(small(evaluate_every=evaluate_every), tmp_path, Workers())
-        trainer.resume(tmp_path / STATE)
+        trainer = resumed(tmp_path, evaluate_every=evaluate_every)
         assert trainer.counters.next_evaluation == due
 
 
-def test_a_run_that_is_stopped_does_not_wait_for_an_evaluation(tmp_path: Path) -> None:
-    trainer = Trainer(small(total_steps=2_000, evaluate_every=100_000), tmp_path, Workers())
+def test_a_run_that_is_stopped_does_not_wait_for_an_evaluation(tmp_path):
+    trainer = trainer_of(tmp_path, total_steps=2_000, evaluate_every=100_000)
     log = StopAfter(trainer, 3)
     assert trainer.train(log) == 'interrupted'
     assert log.rows[-1].get('eval_success') is None
 
 
-def test_a_replay_has_the_permissions_of_its_run(tmp_path: Path) -> None:
-    Trainer(small(total_steps=400), tmp_path, Workers()).save()
-    state, replay = tmp_path / STATE, tmp_path / 'replay.safetensors'
-    assert replay.stat().st_mode == state.stat().st_mode
-
-
-def test_the_newest_episodes_are_kept_in_order(tmp_path: Path) -> None:
-    def replay() -> EpisodeReplay:
+def test_the_newest_episodes_are_kept_in_order(tmp_path):
+    def replay():
         return EpisodeReplay(8, ticks=5, observation_size=3, goal_size=2, action_size=1)
 
     first, file = replay(), tmp_path / 'replay.safetensors'
@@ -249,41 +211,34 @@ def test_the_newest_episodes_are_kept_in_order(tmp_path: Path) -> None:
         load_replay(file, EpisodeReplay(8, 5, 3, 2, action_size=4))
 
 
-def test_a_folder_that_is_being_trained_is_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_folder_that_is_being_trained_is_refused(tmp_path, capsys):
     run = tmp_path / 'run'
     with lock_run(run):
-        assert main(['--task', 'FetchReach', *SET, '--steps', '400', '--output', str(run)]) == 1
-    error = capsys.readouterr().err
-    assert f'{run} is being trained by another process' in error and error.count('\n') == 1
+        assert main([*REACH, '--steps', '400', '--output', str(run)]) == 1
+    assert f'{run} is being trained by another process' in one_line(capsys)
     assert sorted(path.name for path in run.iterdir()) == ['.lock']
-    assert main(['--task', 'FetchReach', *SET, '--steps', '400', '--output', str(run)]) == 0
+    assert main([*REACH, '--steps', '400', '--output', str(run)]) == 0
 
 
-def test_a_file_system_without_locks_takes_runs(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def refuse(*_: object) -> None:
+def test_a_file_system_without_locks_takes_runs(tmp_path, monkeypatch, capsys):
+    def refuse(*_):
         raise OSError(errno.ENOSYS, os.strerror(errno.ENOSYS))
 
     monkeypatch.setattr(fcntl, 'flock', refuse)
     with lock_run(tmp_path / 'run'), alone_in(tmp_path / 'report'):
         pass
-    said = capsys.readouterr().err
-    assert 'has no lock against other processes' in said
-    assert said.count('\n') == 1
+    assert 'has no lock against other processes' in one_line(capsys)
 
 
 @pytest.fixture
-def start_run(tmp_path: Path) -> Iterator[Callable[[], subprocess.Popen[str]]]:
+def start_run(tmp_path):
     """Starts a long run in `run` and waits until it has logged two cycles."""
     run = tmp_path / 'run'
-    arguments = ['--task', 'FetchReach', *SET, '--steps', '100000000', '--output', str(run)]
+    arguments = [*REACH, '--steps', '100000000', '--output', str(run)]
     command = [sys.executable, '-m', 'policy_node.training.train_her', *arguments]
     started = []
 
-    def start(output: int = subprocess.PIPE) -> subprocess.Popen[str]:
+    def start(output=subprocess.PIPE):
         streams = {'stdout': output, 'stderr': output, 'text': True}
         # Without a live line.
         environment = {**os.environ, 'TERM': 'dumb'}
@@ -301,36 +256,32 @@ def start_run(tmp_path: Path) -> Iterator[Callable[[], subprocess.Popen[str]]]:
         process.communicate()
 
 
+def assert_is_saved(run):
+    """The state is as new as the log, and all files are there."""
+    steps, counters = read_progress(run / 'progress.csv')[-1]['env_steps'], counters_of(run)
+    assert counters['env_steps'] == steps >= 800 and counters['updates'] == steps / 100
+    assert (run / 'replay.safetensors').is_file() and (run / 'curve.png').is_file()
+
+
+RELEASE = [signal.SIGTERM, signal.SIGHUP]
+
+
 @pytest.mark.parametrize(
-    'number',
-    [
-        signal.SIGINT,
-        pytest.param(signal.SIGTERM, marks=pytest.mark.release),
-        pytest.param(signal.SIGHUP, marks=pytest.mark.release),
-    ],
+    'number', [signal.SIGINT, *(pytest.param(n, marks=pytest.mark.release) for n in RELEASE)]
 )
-def test_a_signal_is_answered_at_once_and_keeps_the_run(
-    tmp_path: Path, start_run: Callable[[], subprocess.Popen[str]], number: signal.Signals
-) -> None:
+def test_a_signal_is_answered_at_once_and_keeps_the_run(tmp_path, start_run, number):
     process = start_run()
     process.send_signal(number)
-    assert process.stderr is not None
     lines = iter(process.stderr.readline, '')
     assert any('fetch_hand_sim train: stopping after this cycle' in line for line in lines)
     assert process.poll() is None, 'said before the cycle was over'
     output, _ = process.communicate(timeout=60)
     assert process.returncode == 128 + number
     assert f'stopped by {number.name}' in output
-    run = tmp_path / 'run'
-    steps = read_progress(run / 'progress.csv')[-1]['env_steps']
-    counters = json.loads(read_tensors(run / STATE)[1]['counters'])
-    assert counters['env_steps'] == steps >= 800 and counters['updates'] == steps / 100
-    assert (run / 'replay.safetensors').is_file() and (run / 'curve.png').is_file()
+    assert_is_saved(tmp_path / 'run')
 
 
-def test_a_closed_terminal_keeps_the_run(
-    tmp_path: Path, start_run: Callable[..., subprocess.Popen[str]]
-) -> None:
+def test_a_closed_terminal_keeps_the_run(tmp_path, start_run):
     terminal, its_other_end = pty.openpty()
     process = start_run(its_other_end)
     os.close(its_other_end)
@@ -346,13 +297,10 @@ def test_a_closed_terminal_keeps_the_run(
         process.send_signal(signal.SIGHUP)
         time.sleep(0.01)
     assert process.returncode == 128 + signal.SIGHUP
-    run = tmp_path / 'run'
-    steps = read_progress(log)[-1]['env_steps']
-    assert json.loads(read_tensors(run / STATE)[1]['counters'])['env_steps'] == steps
-    assert (run / 'replay.safetensors').is_file() and (run / 'curve.png').is_file()
+    assert_is_saved(tmp_path / 'run')
 
 
-def test_a_missing_library_is_reported_before_the_first_step(tmp_path: Path) -> None:
+def test_a_missing_library_is_reported_before_the_first_step(tmp_path):
     code = (
         'import importlib.abc, sys\n'
         'class Without(importlib.abc.MetaPathFinder):\n'
@@ -370,27 +318,22 @@ def test_a_missing_library_is_reported_before_the_first_step(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize('output', ['file', '/proc/run', 'file/run'])
-def test_an_output_that_cannot_be_a_folder_is_one_line(
-    output: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_output_that_cannot_be_a_folder_is_one_line(output, tmp_path, capsys):
     (tmp_path / 'file').write_text('')
-    assert main(['--task', 'FetchReach', *SET, '--output', str(tmp_path / output)]) == 2
-    error = capsys.readouterr().err
-    assert 'cannot hold a run: ' in error and error.count('\n') == 1 and error[:-1].isprintable()
+    assert main([*REACH, '--output', str(tmp_path / output)]) == 2
+    error = one_line(capsys)
+    assert 'cannot hold a run: ' in error and error[:-1].isprintable()
 
 
-def test_a_full_disk_leaves_no_partial_file_and_the_checkpoint_before(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    config = small(total_steps=2_000, checkpoint_seconds=0)
-    trainer = Trainer(config, tmp_path, Workers())
+def test_a_full_disk_leaves_no_partial_file_and_the_checkpoint_before(tmp_path, capsys):
+    trainer = trainer_of(tmp_path, total_steps=2_000, checkpoint_seconds=0, evaluate_every=1_000)
     trainer.save()
-    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    before = (tmp_path / STATE).read_bytes()
     for size in (1_000, 700_000):
         with files_at_most(size), pytest.raises(OSError):
             trainer.train()
         assert 'no checkpoint, the one before is kept: ' in capsys.readouterr().err
         assert not [path for path in os.listdir(tmp_path) if path.endswith('.partial')]
-        assert (tmp_path / STATE).read_bytes() == before[STATE]
+        assert (tmp_path / STATE).read_bytes() == before
     trainer.save()
-    assert json.loads(read_tensors(tmp_path / STATE)[1]['counters'])['updates'] == 20
+    assert counters_of(tmp_path)['updates'] == 20

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import shutil
-from pathlib import Path
 
 import pytest
 
 from policy_node.training.runs.run_log import COLUMNS, RunLog, draw_curve, read_progress
 
 
-def row(steps: int, success: float | None) -> dict[str, float | None]:
-    values: dict[str, float | None] = dict.fromkeys(COLUMNS, 1.0)
+def row(steps, success):
+    values = dict.fromkeys(COLUMNS, 1.0)
     return {**values, 'env_steps': steps, 'eval_success': success, 'train_success': 0.25}
 
 
-def test_a_resumed_run_goes_on_after_its_checkpoint(tmp_path: Path) -> None:
+def test_a_resumed_run_goes_on_after_its_checkpoint(tmp_path):
     for resumed_steps, steps in ((0, (100, 200, 300)), (200, (250,))):
         log = RunLog(tmp_path, 1000, 0, resumed_steps)
         for step in steps:
@@ -28,7 +27,7 @@ def test_a_resumed_run_goes_on_after_its_checkpoint(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize('cut', ['1,200,1', '1,200,1,,0.5,-', '1,inf,1,,0.5', '1,200,1,,nan'])
-def test_a_line_that_a_killed_run_cut_short_is_dropped(tmp_path: Path, cut: str) -> None:
+def test_a_line_that_a_killed_run_cut_short_is_dropped(tmp_path, cut):
     log = RunLog(tmp_path, 1000, 0)
     log.write(row(100, 0.5))
     log.close()
@@ -39,9 +38,7 @@ def test_a_line_that_a_killed_run_cut_short_is_dropped(tmp_path: Path, cut: str)
     assert [values['env_steps'] for values in read_progress(tmp_path / 'progress.csv')] == [100]
 
 
-def test_the_live_line_shows_the_progress(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_live_line_shows_the_progress(tmp_path, capsys):
     log = RunLog(tmp_path, total_steps=7_300_000, time_limit=0)
     log.write({**row(100_000, 0.5), 'steps_per_second': 2000.0, 'seconds': 61.0})
     log.close()
@@ -51,7 +48,7 @@ def test_the_live_line_shows_the_progress(
     assert 'ETA 1:00:00' in line
 
 
-def test_tensorboard_holds_the_scalars(tmp_path: Path) -> None:
+def test_tensorboard_holds_the_scalars(tmp_path):
     pytest.importorskip('tensorboard')
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -65,9 +62,7 @@ def test_tensorboard_holds_the_scalars(tmp_path: Path) -> None:
     assert [e.step for e in events.Scalars('train_success')] == [100, 200]
 
 
-def test_a_removed_folder_prints_no_traceback(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_removed_folder_prints_no_traceback(tmp_path, capfd):
     (tmp_path / 'run').mkdir()
     log = RunLog(tmp_path / 'run', total_steps=1000, time_limit=0, quiet=True)
     shutil.rmtree(tmp_path / 'run')
@@ -77,7 +72,7 @@ def test_a_removed_folder_prints_no_traceback(
     assert capfd.readouterr().err == ''
 
 
-def test_the_curve_is_a_png_that_shows_the_numbers(tmp_path: Path) -> None:
+def test_the_curve_is_a_png_that_shows_the_numbers(tmp_path):
     low = [{'env_steps': 100.0 * i, 'train_success': 0.1, 'eval_success': 0.1} for i in range(5)]
     high = [{**row, 'eval_success': 0.9} for row in low]
     pictures = []

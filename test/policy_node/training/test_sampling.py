@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 import torch
-from numpy.typing import ArrayLike
 
 from fetch_hand_sim.simulation.rewards import GoalMetric
-from msgs_spec.arrays import Array, Array32
-from msgs_spec.tasks import TaskSpec, task_spec
+from msgs_spec.tasks import task_spec
 from policy_node.policies.actor import Actor
 from policy_node.policies.network_shape import NetworkShape
 from policy_node.training.configuration.recipes import recipe_config
-from policy_node.training.experience.replay import Episodes, Starts, Transitions
+from policy_node.training.experience.replay import Episodes, Starts
 from policy_node.training.experience.sampling import TransitionSampler
 from policy_node.training.machine import Workers
 from policy_node.training.research.conditions import ConditionedSampler, Horizon, Threshold, fold
@@ -29,20 +25,18 @@ REAL = {'real': 1.0}
 
 
 @pytest.fixture
-def walk() -> Episodes:
+def walk():
     """Twenty walks from place 0 to 6, a step each; the goal is place 4; actions are 1."""
     place = np.tile(np.arange(TICKS + 1, dtype=np.float32)[None, :, None], (20, 1, 1))
     goal = np.full((20, 1), 4.0, np.float32)
     return Episodes(place, place, goal, np.ones((20, TICKS, 1), np.float32))
 
 
-def at_goal(achieved: np.ndarray, goal: np.ndarray) -> np.ndarray:
+def at_goal(achieved, goal):
     return (np.abs(achieved - goal).max(axis=-1) < 0.5) - 1.0
 
 
-def draw(
-    episodes: Episodes, sampler: TransitionSampler, mixture: dict[str, float] = REAL
-) -> Transitions:
+def draw(episodes, sampler, mixture=REAL):
     generator = np.random.default_rng(0)
     row = generator.integers(len(episodes), size=4_000)
     return sampler.sample(episodes, row, mixture, generator)
@@ -51,17 +45,17 @@ def draw(
 class Judge:
     """Acts as the walk does before place 3 and otherwise after; likes goals near 5."""
 
-    def act(self, observation: Array32, goal: Array32) -> Array32:
+    def act(self, observation, goal):
         return np.where(observation < 3.0, 1.0, -1.0).astype(np.float32)
 
-    def bellman(self, batch: Transitions) -> Array32:
+    def bellman(self, batch):
         return -np.abs(batch.goal[:, 0] - 5.0)
 
-    def uncertain(self, batch: Transitions) -> Array32:
+    def uncertain(self, batch):
         return batch.goal[:, 0]
 
 
-def test_a_return_sums_discounted_rewards_and_bootstraps_where_it_ends(walk: Episodes) -> None:
+def test_a_return_sums_discounted_rewards_and_bootstraps_where_it_ends(walk):
     batch = draw(walk, TransitionSampler(at_goal, 0.5, 3))
     first, last = batch.observation[:, 0], batch.next_observation[:, 0]
     assert (last == np.minimum(first + 3, TICKS)).all(), 'never beyond the episode'
@@ -71,13 +65,13 @@ def test_a_return_sums_discounted_rewards_and_bootstraps_where_it_ends(walk: Epi
     assert {float(p): float(r) for p, r in zip(first, batch.reward, strict=True)} == expected
 
 
-def test_several_steps_of_one_are_one_step(walk: Episodes) -> None:
+def test_several_steps_of_one_are_one_step(walk):
     sampler = TransitionSampler(at_goal, 0.9)
     starts = Starts(walk, np.repeat(np.arange(20), TICKS), np.tile(np.arange(TICKS), 20))
     goal = walk.desired_goal[starts.row]
     plain = sampler.single(starts, goal)
 
-    def reward(achieved: Array32, chosen: np.ndarray) -> np.ndarray:
+    def reward(achieved, chosen):
         return at_goal(achieved, goal[chosen])
 
     counted = sampler.several(starts, np.ones_like(starts.row), goal, reward)
@@ -85,7 +79,7 @@ def test_several_steps_of_one_are_one_step(walk: Episodes) -> None:
         np.testing.assert_array_equal(getattr(plain, name), getattr(counted, name))
 
 
-def test_lambda_draws_the_weights_of_the_lambda_return(walk: Episodes) -> None:
+def test_lambda_draws_the_weights_of_the_lambda_return(walk):
     batch = draw(walk, LambdaSampler(at_goal, 0.5, 3, trace=0.6))
     start = batch.observation[:, 0] == 0.0
     steps = (batch.next_observation - batch.observation)[start, 0]
@@ -93,7 +87,7 @@ def test_lambda_draws_the_weights_of_the_lambda_return(walk: Episodes) -> None:
     assert shares == pytest.approx([0.4, 0.24, 0.36], abs=0.05)
 
 
-def test_cut_ends_a_return_before_an_action_the_actor_would_not_take(walk: Episodes) -> None:
+def test_cut_ends_a_return_before_an_action_the_actor_would_not_take(walk):
     batch = draw(walk, CuttingSampler(at_goal, 0.5, 5, judge=Judge()))
     first, last = batch.observation[:, 0], batch.next_observation[:, 0]
     # At places 3 and up it would turn round; the first action of a return is always its own.
@@ -102,9 +96,7 @@ def test_cut_ends_a_return_before_an_action_the_actor_would_not_take(walk: Episo
 
 
 @pytest.mark.parametrize(('choice', 'lowest'), [('bellman', 4.0), ('uncertain', 4.0)])
-def test_the_best_of_several_future_goals_is_taken(
-    walk: Episodes, choice: str, lowest: float
-) -> None:
+def test_the_best_of_several_future_goals_is_taken(walk, choice, lowest):
     mixture = {'future': 0.5, 'real': 0.5}
     any_goal = draw(walk, TransitionSampler(at_goal, 0.9), mixture)
     batch = draw(walk, ChoosingSampler(at_goal, 0.9, choice=choice, judge=Judge()), mixture)
@@ -118,7 +110,7 @@ def test_the_best_of_several_future_goals_is_taken(
     assert (batch.goal[:, 0] >= np.minimum(batch.observation[:, 0] + 1, lowest)).all()
 
 
-def test_a_threshold_is_in_the_reward_and_in_the_input() -> None:
+def test_a_threshold_is_in_the_reward_and_in_the_input():
     metric = GoalMetric(task_spec('FetchReach'))
     condition = Threshold(metric, widest=8.0)
     drawn = condition.draw(2_000, np.random.default_rng(0))
@@ -133,16 +125,16 @@ def test_a_threshold_is_in_the_reward_and_in_the_input() -> None:
 class Halved(GoalMetric):
     """A reward of its own, with a parameter that is no field."""
 
-    def __init__(self, spec: TaskSpec, scale: float = 1.0, **others: Any) -> None:
+    def __init__(self, spec, scale=1.0, **others):
         super().__init__(spec, **others)
         object.__setattr__(self, 'scale', scale)
 
-    def reward(self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any = None) -> Array:
-        scale: float = self.__dict__['scale']
+    def reward(self, achieved_goal, desired_goal, info=None):
+        scale = self.__dict__['scale']
         return -scale * self.distances(achieved_goal, desired_goal)[0]
 
 
-def test_hindsight_is_rewarded_by_a_metric_of_its_own_as_steps_are() -> None:
+def test_hindsight_is_rewarded_by_a_metric_of_its_own_as_steps_are():
     metric = Halved(task_spec('FetchReach'), scale=0.5)
     goals = np.zeros((2, 3)), np.full((2, 3), 0.1)
     for change in ({}, {'first_distance': 4.0}):
@@ -160,18 +152,18 @@ def test_hindsight_is_rewarded_by_a_metric_of_its_own_as_steps_are() -> None:
         ({'condition': 'threshold'}, 'condition threshold would replace the reward of '),
     ],
 )
-def test_no_other_reward_takes_the_place_of_a_tasks_own(change: dict[str, str], line: str) -> None:
+def test_no_other_reward_takes_the_place_of_a_tasks_own(change, line):
     config = recipe_config('FetchReach', 'best', **change)
     with pytest.raises(ValueError, match=f'{line}FetchReach itself .Halved.; allowed: none'):
         make_sampler(config, Halved(task_spec('FetchReach')))
     make_sampler(config, GoalMetric(task_spec('FetchReach')))
 
 
-def past_goal(achieved: np.ndarray, goal: np.ndarray) -> np.ndarray:
+def past_goal(achieved, goal):
     return (achieved > goal - 0.5)[:, 0] - 1.0
 
 
-def test_values_count_the_rewards_of_the_steps_left(walk: Episodes) -> None:
+def test_values_count_the_rewards_of_the_steps_left(walk):
     torch.manual_seed(0)
     options = {'precision': 'float32', 'gamma': 0.5, 'learning_rate': 3e-3, 'target': 'none'}
     config = recipe_config('FetchReach', 'paper', condition='horizon', **options)
@@ -193,7 +185,7 @@ def test_values_count_the_rewards_of_the_steps_left(walk: Episodes) -> None:
     assert found[5.0] == pytest.approx([0.0, 0.0, 0.0], abs=0.15)
 
 
-def test_an_actor_at_one_condition_is_an_actor_like_any_other() -> None:
+def test_an_actor_at_one_condition_is_an_actor_like_any_other():
     options = {'precision': 'float32', 'condition': 'threshold'}
     config = recipe_config('FetchReach', 'paper', **options)
     learner = make_ddpg(NetworkShape(4, 3, 2, (16, 16)), config, torch.device('cpu'), Workers())

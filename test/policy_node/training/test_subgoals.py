@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
@@ -30,17 +28,15 @@ torch.set_num_threads(1)
 class Constant:
     """A policy whose every action is the same number."""
 
-    def __init__(self, value: float, size: int) -> None:
+    def __init__(self, value, size):
         self.value, self.size = value, size
 
-    def predict(
-        self, observation: dict, state: object = None, *, deterministic: bool = True
-    ) -> tuple:
+    def predict(self, observation, state=None, *, deterministic=True):
         count = len(np.asarray(observation['observation']))
         return np.full((count, self.size), self.value, np.float32), None
 
 
-def collected(proposer: Proposer | None, noise: tuple[float, float], actor: object) -> Episodes:
+def collected(proposer, noise, actor):
     simulation = Simulation('FetchReach', num_envs=80, num_threads=1)
     std, epsilon = noise
     config = from_flat(
@@ -51,7 +47,7 @@ def collected(proposer: Proposer | None, noise: tuple[float, float], actor: obje
     return collector.collect(policy)[0]
 
 
-def test_subgoals_hold_follow_the_action_and_are_tested_without_noise() -> None:
+def test_subgoals_hold_follow_the_action_and_are_tested_without_noise():
     torch.manual_seed(0)
     actor = Actor(NetworkShape(10, 3, 4, (8,))).eval()
     mean, std = np.full(3, 0.5, np.float32), np.full(3, 0.1, np.float32)
@@ -75,25 +71,25 @@ def test_subgoals_hold_follow_the_action_and_are_tested_without_noise() -> None:
     assert (moved[test[:, 30] == 1.0] < 1e-5).all() and (moved[test[:, 30] == 0.0] > 1e-4).all()
 
 
-def test_without_a_high_level_the_goal_itself_is_pursued() -> None:
+def test_without_a_high_level_the_goal_itself_is_pursued():
     episodes = collected(None, (0.0, 0.0), Constant(0.0, 4))
     goal = np.repeat(episodes.desired_goal[:, None], 50, axis=1)
     np.testing.assert_array_equal(episodes.action[..., 4:7], goal)
     assert (episodes.action[..., 7] == 0.0).all()
 
 
-def test_proposals_of_poses_end_with_unit_quaternions() -> None:
+def test_proposals_of_poses_end_with_unit_quaternions():
     mean, std = np.zeros(7, np.float32), np.arange(1.0, 8.0, dtype=np.float32)
     goals = Proposer(Constant(0.1, 7), mean, std, is_pose=True).goals(np.ones((2, 7), np.float32))
     np.testing.assert_allclose(goals[:, :3], [[1, 2, 3]] * 2)
     np.testing.assert_allclose(np.linalg.norm(goals[:, 3:], axis=1), 1.0, rtol=1e-6)
 
 
-def test_both_levels_act_as_one_for_whole_episodes() -> None:
-    asked: list[float] = []
+def test_both_levels_act_as_one_for_whole_episodes():
+    asked = []
 
     class Counting(Constant):
-        def predict(self, observation: dict, *, deterministic: bool = True) -> tuple:
+        def predict(self, observation, *, deterministic=True):
             asked.append(float(observation['observation'][0, 0]))
             return super().predict(observation)
 
@@ -106,7 +102,7 @@ def test_both_levels_act_as_one_for_whole_episodes() -> None:
     assert asked == [0, 3, 5, 8]
 
 
-def walk(subgoal: float, tested: float) -> Episodes:
+def walk(subgoal, tested):
     """To the right by one a tick, the subgoal the same throughout."""
     place = np.arange(7, dtype=np.float32)[None, :, None]
     action = np.tile(np.array([1.0, subgoal, tested], np.float32), (1, 6, 1))
@@ -116,9 +112,7 @@ def walk(subgoal: float, tested: float) -> Episodes:
 @pytest.mark.parametrize(
     ('subgoal', 'tested', 'missed'), [(9.0, 1.0, True), (9.0, 0.0, False), (3.0, 1.0, False)]
 )
-def test_what_was_achieved_was_proposed_unless_a_test_was_missed(
-    subgoal: float, tested: float, missed: bool
-) -> None:
+def test_what_was_achieved_was_proposed_unless_a_test_was_missed(subgoal, tested, missed):
     """Three ticks lead three places on; rewards are known, and so is what a test costs.
 
     The second proposal of 3 is missed, at 6.
@@ -140,7 +134,7 @@ def test_what_was_achieved_was_proposed_unless_a_test_was_missed(
     np.testing.assert_allclose(batch.reward, np.where(penalty, -2.0, summed))
 
 
-def test_half_of_the_goals_that_are_kept_are_subgoals() -> None:
+def test_half_of_the_goals_that_are_kept_are_subgoals():
     assert with_subgoals({'future': 0.8, 'real': 0.2}) == {
         'future': 0.8,
         'real': 0.1,
@@ -149,9 +143,7 @@ def test_half_of_the_goals_that_are_kept_are_subgoals() -> None:
     assert with_subgoals({'future': 1.0}) == {'future': 1.0}
 
 
-def test_logged_episodes_have_no_subgoals(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_logged_episodes_have_no_subgoals(tmp_path, capsys):
     arguments = ['--task', 'FetchReach', '--set', 'subgoal_every=10', '--output', str(tmp_path)]
     assert main([*arguments, '--from-episodes', str(tmp_path)]) == 2
     error = capsys.readouterr().err

@@ -19,16 +19,13 @@ from fetch_hand_sim.simulation.tasks import registry
 from fetch_hand_sim.simulation.tasks.fetch import FETCH_CONFIGS, FetchTask
 from policy_node import load_policy
 from policy_node.training.runs.trainer import _collecting_thread
-from support import script_environment
+from support import runs, script_environment
 
 for _library in ('matplotlib', 'tensorboard'):
     pytest.importorskip(_library)
 from policy_node.training import Run, train  # noqa: E402
 
-torch.set_num_threads(1)
-
-SMALL = {'num_envs': 8, 'updates_per_cycle': 4, 'batch_size': 64, 'evaluation_episodes': 8}
-SMALL |= {'simulation_threads': 1, 'torch_threads': 1, 'evaluate_every': 400, 'quiet': True}
+SMALL = runs.SMALL | {'quiet': True}
 
 
 def test_a_run_leaves_an_actor_and_its_curve(tmp_path, capfd):
@@ -64,10 +61,9 @@ def test_a_warning_names_rewards_above_0(tmp_path, capfd, monkeypatch):
 
 
 def test_the_record_contains_all_arguments(tmp_path):
-    fields = {name: value for name, value in SMALL.items() if name != 'quiet'}
     train('FetchReach', tmp_path, recipe='best', total_steps=400, goals='future=.8', **SMALL)
     train('FetchReach', tmp_path, resume=True, gamma=np.float64(0.9), total_steps=800, quiet=True)
-    named = {'recipe': 'best', 'total_steps': 400, 'goals': {'future': 0.8}, **fields}
+    named = {'recipe': 'best', 'total_steps': 400, 'goals': {'future': 0.8}, **runs.SMALL}
     first = ''.join(f', {name}={value!r}' for name, value in named.items())
     assert (tmp_path / 'command.txt').read_text().splitlines() == [
         f"policy_node.training.train('FetchReach', {str(tmp_path)!r}{rest})"
@@ -78,9 +74,13 @@ def test_the_record_contains_all_arguments(tmp_path):
 def test_the_function_trains_as_the_command(tmp_path):
     """Bit for bit."""
     run = train('FetchReach', tmp_path / 'function', total_steps=800, overlap=False, **SMALL)
-    options = [f'--set={name}={value}' for name, value in SMALL.items() if name != 'quiet']
     command = [sys.executable, '-m', 'policy_node.training.train_her', '--task', 'FetchReach']
-    command += [*options, '--set=overlap=false', '--steps=800', f'--output={tmp_path / "command"}']
+    command += [
+        *runs.options_of(**runs.SMALL),
+        '--set=overlap=false',
+        '--steps=800',
+        f'--output={tmp_path / "command"}',
+    ]
     subprocess.run(command, check=True, env=script_environment(), timeout=120)
     zeros = {'observation': np.zeros(10), 'achieved_goal': np.zeros(3), 'desired_goal': np.ones(3)}
     ours, theirs = (

@@ -7,7 +7,6 @@ import dataclasses
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,51 +15,38 @@ import torch
 from fetch_hand_sim.simulation import Simulation
 from msgs_spec.tasks import task_spec
 from policy_node.policies import checkpoint
-from policy_node.policies.files import read_tensors
 from policy_node.policies.policy import RandomPolicy
-from policy_node.training.configuration.config import TrainConfig
-from policy_node.training.configuration.recipes import recipe_config
 from policy_node.training.evaluation import EpisodeOutcomes
 from policy_node.training.experience.episode_files import read_experience
 from policy_node.training.experience.rewards import GradedReward
 from policy_node.training.generate_episodes import main as generate_episodes
-from policy_node.training.machine import Workers
 from policy_node.training.runs.run import train_run
 from policy_node.training.runs.run_log import read_progress
-from policy_node.training.runs.trainer import Collected, Trainer
+from policy_node.training.runs.trainer import Collected
 from policy_node.training.runs.training_state import TrainingError, read_state
 from policy_node.training.ship_actor import main as ship_actor
 from policy_node.training.train_her import main
-
-torch.set_num_threads(1)
+from support.runs import (
+    SMALL,
+    STATE,
+    one_line,
+    options_of,
+    resumed,
+    same,
+    small,
+    trained,
+    trainer_of,
+    weights,
+)
 
 THREADS = ['--threads', '1', '--torch-threads', '1']
 PPO = ['--algorithm', 'ppo', '--no-overlap', '--random-epsilon', '0']
 # A run of seconds: 8 simulations, 3 cycles.
-SMALL = [
-    *['--task', 'FetchReach', '--num-envs', '8', '--steps', '1200', *THREADS],
-    *['--set', 'updates_per_cycle=4', '--set', 'batch_size=64', '--set', 'evaluate_every=400'],
-    *['--set', 'evaluation_episodes=8'],
-]
-
-
-def weights(path: Path) -> dict[str, torch.Tensor]:
-    return {name: torch.tensor(values) for name, values in read_tensors(path)[0].items()}
-
-
-def same(first: Path, second: Path) -> bool:
-    one, two = weights(first), weights(second)
-    return one.keys() == two.keys() and all(torch.equal(one[name], two[name]) for name in one)
-
-
-def small_config(**changes: object) -> TrainConfig:
-    options = {'num_envs': 8, 'updates_per_cycle': 4, 'batch_size': 64, 'simulation_threads': 1}
-    options |= {'torch_threads': 1, 'evaluation_episodes': 8}
-    return recipe_config('FetchReach', 'best', **{**options, **changes})
+RUN = ['--task', 'FetchReach', '--steps', '1200', *options_of(**SMALL)]
 
 
 @pytest.mark.release
-def test_fetch_reach_is_learnt_from_nothing(tmp_path: Path) -> None:
+def test_fetch_reach_is_learnt_from_nothing(tmp_path):
     arguments = ['--task', 'FetchReach', '--success-target', '1', '--steps', '40000']
     assert main([*arguments, *THREADS, '--output', str(tmp_path / 'run')]) == 0
     _, info = checkpoint.load(tmp_path / 'run' / 'best.safetensors', task='FetchReach')
@@ -72,20 +58,8 @@ def test_fetch_reach_is_learnt_from_nothing(tmp_path: Path) -> None:
     assert rows[-1]['eval_success'] == 1.0 and rows[-1]['eval_stay'] > 0.9
     assert rows[0]['train_success'] < 0.5 < rows[-1]['train_success']
     assert (tmp_path / 'run' / 'curve.png').read_bytes()[:4] == b'\x89PNG'
-    assert (
-        ship_actor(
-            [
-                str(tmp_path / 'run'),
-                '--episodes',
-                '50',
-                '--threads',
-                '1',
-                '--actors',
-                str(tmp_path / 'actors'),
-            ]
-        )
-        == 0
-    )
+    options = ['--episodes', '50', '--threads', '1', '--actors', str(tmp_path / 'actors')]
+    assert ship_actor([str(tmp_path / 'run'), *options]) == 0
     assert sorted(path.name for path in (tmp_path / 'actors').iterdir()) == [
         'FetchReach.json',
         'FetchReach.png',
@@ -95,69 +69,66 @@ def test_fetch_reach_is_learnt_from_nothing(tmp_path: Path) -> None:
     shipped = tmp_path / 'actors' / 'FetchReach.json'
     before = shipped.read_bytes()
     # It is the shipped one already.
-    options = ['--episodes', '50', '--threads', '1', '--actors', str(tmp_path / 'actors')]
     assert ship_actor([str(tmp_path / 'run'), *options]) == 0
     assert shipped.read_bytes() == before
 
 
 @pytest.mark.release
 @pytest.mark.parametrize('overlap', ['true', 'false'])
-def test_the_same_seed_gives_the_same_weights_bit_for_bit(tmp_path: Path, overlap: str) -> None:
+def test_the_same_seed_gives_the_same_weights_bit_for_bit(tmp_path, overlap):
     for name, seed in (('a', '5'), ('b', '5'), ('c', '6')):
         extra = ['--seed', seed, '--set', f'overlap={overlap}', '--output', str(tmp_path / name)]
-        assert main([*SMALL, *extra]) == 0
-    latest, state = 'latest.safetensors', 'training_state.safetensors'
-    assert same(tmp_path / 'a' / latest, tmp_path / 'b' / latest)
-    assert same(tmp_path / 'a' / state, tmp_path / 'b' / state)
-    assert not same(tmp_path / 'a' / latest, tmp_path / 'c' / latest)
+        assert main([*RUN, *extra]) == 0
+    latest = 'latest.safetensors'
+    for name in (latest, STATE):
+        assert same(weights(tmp_path / 'a' / name), weights(tmp_path / 'b' / name))
+    assert not same(weights(tmp_path / 'a' / latest), weights(tmp_path / 'c' / latest))
 
 
-def test_resume_goes_on_where_the_run_stopped(tmp_path: Path) -> None:
+def test_resume_goes_on_where_the_run_stopped(tmp_path):
     run = tmp_path / 'run'
-    assert main([*SMALL, '--output', str(run)]) == 0
-    before = weights(run / 'training_state.safetensors')
+    assert main([*RUN, '--output', str(run)]) == 0
+    before = weights(run / STATE)
     assert main(['--resume', str(run), '--steps', '3200']) == 0
     rows = list(csv.DictReader((run / 'progress.csv').open()))
     steps = [int(row['env_steps']) for row in rows]
     assert steps == [400, 800, 1200, 1600, 2000, 2400, 2800, 3200]
     updates = [int(row['updates']) for row in rows]
     assert updates == [4, 8, 12, 16, 20, 24, 28, 32]
-    after = weights(run / 'training_state.safetensors')
+    after = weights(run / STATE)
     count = 'observation_statistics.count'
     assert before[count] == 1200 and after[count] == 3200
     assert checkpoint.read_info(run / 'latest.safetensors').env_steps == 3200
 
 
-def test_the_latest_actor_is_the_averaged_one_that_evaluations_measure(tmp_path: Path) -> None:
+def test_the_latest_actor_is_the_averaged_one_that_evaluations_measure(tmp_path):
     run = tmp_path / 'run'
-    assert main([*SMALL, '--set', 'actor_average=.9', '--output', str(run)]) == 0
-    state = weights(run / 'training_state.safetensors')
+    assert main([*RUN, '--set', 'actor_average=.9', '--output', str(run)]) == 0
+    state = weights(run / STATE)
     name = 'output.weight'
     assert not torch.equal(state[f'average_actor.{name}'], state[f'actor.network.{name}'])
     latest = checkpoint.load(run / 'latest.safetensors')[0]
     assert torch.equal(latest.network.state_dict()[name], state[f'average_actor.{name}'])
 
 
-def test_a_training_state_restores_everything(tmp_path: Path) -> None:
-    config = small_config(total_steps=1200)
-    first = Trainer(config, tmp_path, Workers())
-    first.train()
-    second = Trainer(dataclasses.replace(config, seed=9), tmp_path, Workers())
+def test_a_training_state_restores_everything(tmp_path):
+    first = trained(tmp_path, total_steps=1200)
+    second = trainer_of(tmp_path, total_steps=1200, seed=9)
     fresh = second.collector.collect(second.learner.actor)[0]
-    second.resume(tmp_path / 'training_state.safetensors')
+    second.resume(tmp_path / STATE)
     assert second.counters == first.counters
     resumed = second.collector.collect(second.learner.actor)[0]
     assert (resumed.desired_goal != fresh.desired_goal).all(), 'episodes would come twice'
     second.save()
-    tensors = weights(tmp_path / 'training_state.safetensors')
+    tensors = weights(tmp_path / STATE)
     assert any(name.startswith('critic_optimizer.0.exp_avg') for name in tensors)
     first.save()
-    again = weights(tmp_path / 'training_state.safetensors')
+    again = weights(tmp_path / STATE)
     assert all(torch.equal(tensors[name], again[name]) for name in again)
 
 
 @pytest.fixture(scope='module')
-def logged(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def logged(tmp_path_factory):
     """Twelve logged FetchReach episodes of random actions and one of another task."""
     folder = tmp_path_factory.mktemp('logged')
     for task, count in (('FetchReach', 12), ('FetchPush', 1)):
@@ -167,12 +138,10 @@ def logged(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_logged_episodes_are_learnt_from_before_any_step(
-    tmp_path: Path, logged: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_logged_episodes_are_learnt_from_before_any_step(tmp_path, logged, capsys):
     for name, extra in (('with', ['--from-episodes', str(logged)]), ('without', [])):
         waits = ['--set', 'learning_starts=1000', '--output', str(tmp_path / name)]
-        assert main([*SMALL, *waits, *extra]) == 0
+        assert main([*RUN, *waits, *extra]) == 0
     said = capsys.readouterr().err
     assert f'12 episodes from {logged}; 1 left out, first: ' in said
     assert 'FetchPush, not FetchReach' in said
@@ -183,49 +152,42 @@ def test_logged_episodes_are_learnt_from_before_any_step(
     assert [row['updates'] for row in with_logs] == [4, 8, 12]
     assert [row['updates'] for row in without] == [0, 0, 4]
     assert [row['env_steps'] for row in with_logs] == [400, 800, 1200]
-    state = weights(tmp_path / 'with' / 'training_state.safetensors')
+    state = weights(tmp_path / 'with' / STATE)
     assert state['observation_statistics.count'] == 1200 + 600
 
 
-def test_workers_share_logged_episodes_and_a_resumed_run_counts_them_once(
-    tmp_path: Path, logged: Path
-) -> None:
+def test_workers_share_logged_episodes_and_a_resumed_run_counts_them_once(tmp_path, logged):
     episodes, _ = read_experience(logged, task_spec('FetchReach'))
-    trainer = Trainer(small_config(total_steps=400), tmp_path, Workers())
-    trainer.train()
-    before = trainer.experience.statistics['observation_statistics'].state()
-    resumed = Trainer(small_config(), tmp_path, Workers())
-    resumed.resume(tmp_path / 'training_state.safetensors')
-    resumed.workers = dataclasses.replace(resumed.workers, rank=1, world_size=3)
-    resumed.add_experience(episodes)
+    statistics = 'observation_statistics'
+    before = trained(tmp_path, total_steps=400).experience.statistics[statistics].state_dict()
+    again = resumed(tmp_path)
+    again.workers = dataclasses.replace(again.workers, rank=1, world_size=3)
+    again.add_experience(episodes)
     # The eight of the run, which are kept beside its state, and a third of the twelve.
-    assert len(resumed.experience.replay) == 8 + 4
-    added = resumed.experience.replay.newest(4)
+    assert len(again.experience.replay) == 8 + 4
+    added = again.experience.replay.newest(4)
     np.testing.assert_array_equal(added.action, episodes.action[1::3])
-    after = resumed.experience.statistics['observation_statistics'].state()
-    assert all(torch.equal(before[name], after[name]) for name in before)
+    assert same(before, again.experience.statistics[statistics].state_dict())
 
 
-def test_logs_that_cannot_be_learnt_from_are_refused(
-    tmp_path: Path, logged: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_logs_that_cannot_be_learnt_from_are_refused(tmp_path, logged, capsys):
     output = ['--output', str(tmp_path / 'run')]
     small = ['--from-episodes', str(logged), '--set', 'replay_transitions=500', *output]
-    assert main([*SMALL, *small]) == 2
+    assert main([*RUN, *small]) == 2
     assert '600 transitions, the replay 500' in capsys.readouterr().err
-    assert main([*SMALL, '--from-episodes', str(tmp_path), *output]) == 2
+    assert main([*RUN, '--from-episodes', str(tmp_path), *output]) == 2
     assert f'{tmp_path} holds no episode' in capsys.readouterr().err
     above = tmp_path / 'above'
     above.mkdir()
     (above / 'inner').symlink_to(logged)
-    assert main([*SMALL, '--from-episodes', str(above), *output]) == 2
+    assert main([*RUN, '--from-episodes', str(above), *output]) == 2
     assert f'holds no episode; there are some in {above / "inner"}' in capsys.readouterr().err
-    assert main([*SMALL, '--from-episodes', str(logged), '--set', 'control_hz=50', *output]) == 2
+    assert main([*RUN, '--from-episodes', str(logged), '--set', 'control_hz=50', *output]) == 2
     assert 'holds no usable episode of FetchReach' in capsys.readouterr().err
     assert not (tmp_path / 'run').exists(), 'refused before anything was written'
 
 
-def test_graded_rewards_are_shares_of_thresholds_met() -> None:
+def test_graded_rewards_are_shares_of_thresholds_met():
     """BlockFull: 0.01 m and 0.1 rad, at multiples of 0.5, 1, 2 and 4 of them."""
     metric = Simulation('HandManipulateBlockFull', num_envs=1, num_threads=1).metric
     goal = np.zeros((5, 7))
@@ -241,9 +203,9 @@ def test_graded_rewards_are_shares_of_thresholds_met() -> None:
     np.testing.assert_array_equal(sparse(achieved, goal), metric.reward(achieved, goal))
 
 
-def test_training_may_grade_its_rewards(tmp_path: Path) -> None:
+def test_training_may_grade_its_rewards(tmp_path):
     """FetchReach succeeds within 0.05 m; within 0.1 m, half of the grades 1 and 2 are met."""
-    trainer = Trainer(small_config(reward_grades='1,2', batch_size=512), tmp_path, Workers())
+    trainer = trainer_of(tmp_path, reward_grades='1,2', batch_size=512)
     trainer.experience.replay.add(trainer.collector.collect(trainer.learner.actor)[0])
     batch = trainer.experience.batch(env_steps=0)
     assert set(batch.reward.tolist()) == {-1.0, -0.5, 0.0}
@@ -254,154 +216,136 @@ def test_training_may_grade_its_rewards(tmp_path: Path) -> None:
     assert trainer.simulation.metric.reward_type == 'sparse'
 
 
-def test_thresholds_of_training_narrow_from_the_first_to_those_of_the_task(tmp_path: Path) -> None:
+def test_thresholds_of_training_narrow_from_the_first_to_those_of_the_task(tmp_path):
     """FetchReach's 0.05 m are 0.2 m at the start, 0.1 m after a third of the run, then 0.05 m."""
-    config = small_config(batch_size=512, first_distance=4.0, total_steps=3_000, goals='random=1')
-    trainer = Trainer(config, tmp_path, Workers())
+    narrowing = {'first_distance': 4.0, 'total_steps': 3_000, 'goals': 'random=1'}
+    trainer = trainer_of(tmp_path, batch_size=512, **narrowing)
     trainer.experience.replay.add(trainer.collector.collect(RandomPolicy(4))[0])
     for env_steps, threshold in ((0, 0.2), (1_000, 0.1), (2_000, 0.05), (3_000, 0.05)):
-        trainer.experience.narrow(env_steps / config.total_steps)
+        trainer.experience.narrow(env_steps / 3_000)
         batch = trainer.experience.batch(env_steps)
         position = batch.next_observation[:, :3].astype(np.float64)
         distance = np.linalg.norm(position - batch.goal, axis=-1)
         clear = np.abs(distance - threshold) > 1e-4
         np.testing.assert_array_equal(batch.reward[clear] == 0.0, distance[clear] < threshold)
         assert ((distance > 0.5 * threshold) & (distance < threshold)).any()
-    with pytest.raises(ValueError, match='first_rotation'):
-        small_config(first_rotation=2.0)
-    with pytest.raises(ValueError, match='reward_type sparse'):
-        small_config(first_distance=2.0, reward_type='dense')
 
 
-def test_settings_of_training_do_not_change_evaluation(tmp_path: Path) -> None:
+def test_settings_of_training_do_not_change_evaluation(tmp_path):
     """The same actor gets the same evaluation with other rewards and goals of training."""
-    task, small = 'HandManipulatePenFull', {'num_envs': 2, 'evaluation_episodes': 2}
-    changes = {'gamma': 0.5}
-    changes |= {'first_distance': 9.0, 'first_rotation': 9.0}
-    changes |= {'ticks_after_drop': 2, 'goals': 'final=1'}
-    changes |= {'moved_share': 0.5}
+    two = {'task': 'HandManipulatePenFull', 'num_envs': 2, 'evaluation_episodes': 2}
+    changes = {'gamma': 0.5, 'first_distance': 9.0, 'first_rotation': 9.0}
+    changes |= {'ticks_after_drop': 2, 'goals': 'final=1', 'moved_share': 0.5}
     results = []
     for extra in ({}, changes):
-        torch.manual_seed(0)
-        config = recipe_config(task, 'best', simulation_threads=1, **small, **extra)
-        trainer = Trainer(config, tmp_path, Workers())
-        actor = trainer.learner.evaluation_actor()
+        trainer = trainer_of(tmp_path, **two, **extra)
         trainer.counters.updates = 1
-        actor, evaluated = trainer._prepare_collection()
-        outcomes = trainer._collect(actor, evaluated).evaluation
-        assert outcomes is not None
+        outcomes = trainer._collect(*trainer._prepare_collection()).evaluation
         results.append([getattr(outcomes, name) for name in outcomes.__slots__])
     for first, second in zip(*results, strict=True):
         np.testing.assert_array_equal(first, second)
 
 
-def test_an_unfitting_state_is_refused_in_one_line(tmp_path: Path) -> None:
-    Trainer(small_config(), tmp_path, Workers()).save()
-    wide = Trainer(small_config(hidden_sizes=(32,)), tmp_path, Workers())
-    with pytest.raises(ValueError, match=r'training_state.safetensors') as caught:
-        wide.resume(tmp_path / 'training_state.safetensors')
+def test_an_unfitting_state_is_refused_in_one_line(tmp_path):
+    trainer_of(tmp_path).save()
+    wide = trainer_of(tmp_path, hidden_sizes=(32,))
+    with pytest.raises(ValueError, match=STATE) as caught:
+        wide.resume(tmp_path / STATE)
     assert '\n' not in str(caught.value)
     with pytest.raises(ValueError, match='fetch_hand_actor'):
         wide.resume(tmp_path / 'latest.safetensors')
 
 
-def test_a_loss_that_is_not_finite_stops_the_run_and_keeps_the_checkpoint(tmp_path: Path) -> None:
-    trainer = Trainer(small_config(total_steps=10_000, checkpoint_seconds=0), tmp_path, Workers())
-    update, count = trainer.learner.update, 0
+def poison_critic(learner):
+    learner.critic.network.output.bias.fill_(float('nan'))
 
-    def poisoned(batch: object) -> object:
-        nonlocal count
-        count += 1
-        if count == 10:
+
+def poison_actor(learner):
+    learner.actor.network.output.weight.fill_(float('inf'))
+
+
+@pytest.mark.parametrize(
+    ('poison', 'due', 'overlap', 'message'),
+    [
+        (poison_critic, 9, True, 'critic loss is nan in update 10, after 1200'),
+        # Every loss is finite, as those before the last step of a cycle are.
+        (poison_actor, 12, True, r'network\.output\.weight'),
+        (poison_actor, 12, False, r'network\.output\.weight'),
+    ],
+)
+def test_what_is_not_finite_stops_the_run_before_it_acts_or_is_saved(
+    tmp_path, poison, due, overlap, message
+):
+    fields = {'total_steps': 10_000, 'checkpoint_seconds': 0, 'overlap': overlap}
+    trainer = trainer_of(tmp_path, **fields)
+    update, updates = trainer.learner.update, []
+
+    def poisoned(batch):
+        updates.append(batch)
+        losses = update(batch)
+        if len(updates) == due:
             with torch.no_grad():
-                trainer.learner.critic.network.output.bias.fill_(float('nan'))
-        return update(batch)  # type: ignore[arg-type]
-
-    trainer.learner.update = poisoned  # type: ignore[method-assign,assignment]
-    with pytest.raises(TrainingError, match='critic loss is nan in update 10, after 1200'):
-        trainer.train()
-    kept = weights(tmp_path / 'training_state.safetensors')
-    assert all(torch.isfinite(value.float()).all() for value in kept.values())
-    assert read_state(tmp_path / 'training_state.safetensors').extra['config']['num_envs'] == 8
-
-
-@pytest.mark.parametrize('overlap', [False, True])
-def test_weights_that_a_step_has_ruined_stop_the_run_before_they_act_or_are_saved(
-    tmp_path: Path, overlap: bool
-) -> None:
-    """Also where every loss was finite, as those before the step are."""
-    config = small_config(total_steps=10_000, checkpoint_seconds=0, overlap=overlap)
-    trainer = Trainer(config, tmp_path, Workers())
-    update, count = trainer.learner.update, 0
-
-    def ruinous(batch: object) -> object:
-        nonlocal count
-        count += 1
-        losses = update(batch)  # type: ignore[arg-type]
-        if count == 3 * config.updates_per_cycle:
-            with torch.no_grad():
-                trainer.learner.actor.network.output.weight.fill_(float('inf'))
+                poison(trainer.learner)
         return losses
 
-    trainer.learner.update = ruinous  # type: ignore[method-assign,assignment]
-    with pytest.raises(TrainingError, match=r'network\.output\.weight'):
+    trainer.learner.update = poisoned
+    with pytest.raises(TrainingError, match=message):
         trainer.train()
-    kept = weights(tmp_path / 'training_state.safetensors')
+    kept = weights(tmp_path / STATE)
     assert all(torch.isfinite(value.float()).all() for value in kept.values())
+    assert read_state(tmp_path / STATE).extra['config']['num_envs'] == 8
 
 
-def test_networks_whose_files_could_not_be_read_are_refused_at_once(tmp_path: Path) -> None:
+def test_networks_whose_files_could_not_be_read_are_refused_at_once(tmp_path):
     with pytest.raises(ValueError, match='67,'):
-        Trainer(small_config(hidden_sizes=(4096, 4096)), tmp_path, Workers())
+        trainer_of(tmp_path, hidden_sizes=(4096, 4096))
 
 
-def test_a_restarted_run_has_one_part(tmp_path: Path) -> None:
+def test_a_restarted_run_has_one_part(tmp_path):
     """One that was killed before it had saved anything does not count."""
     (tmp_path / 'command.txt').write_text('fetch_hand_sim train of before\n')
-    train_run(small_config(total_steps=800), tmp_path, command='fetch_hand_sim train of now')
+    train_run(small(total_steps=800), tmp_path, command='fetch_hand_sim train of now')
     assert (tmp_path / 'command.txt').read_text() == 'fetch_hand_sim train of now\n'
-    train_run(small_config(total_steps=1600), tmp_path, resume=True, command='more')
+    train_run(small(total_steps=1600), tmp_path, resume=True, command='more')
     assert (tmp_path / 'command.txt').read_text() == 'fetch_hand_sim train of now\nmore\n'
-    train_run(small_config(total_steps=1600), tmp_path, resume=True, command='nothing to do')
+    train_run(small(total_steps=1600), tmp_path, resume=True, command='nothing to do')
     assert (tmp_path / 'command.txt').read_text() == 'fetch_hand_sim train of now\nmore\n'
 
 
-def test_a_new_run_sets_the_files_of_an_earlier_one_aside(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_new_run_sets_the_files_of_an_earlier_one_aside(tmp_path, capsys):
     """Otherwise the best actor of the earlier run would stay, even of another task."""
     (tmp_path / 'tensorboard').mkdir()
     names = 'best.safetensors', '1.replay.safetensors', 'tensorboard/events', 'progress.csv'
     for part in ('former1', 'former2'):
         for name in (*names, 'mine'):
             (tmp_path / name).write_text(f'{part} {name}')
-        train_run(small_config(total_steps=400, learning_starts=1000), tmp_path)
+        train_run(small(total_steps=400, learning_starts=1000), tmp_path)
         assert f'an earlier run in {tmp_path}' in capsys.readouterr().err
         for name in names:
             assert (tmp_path / part / name).read_text() == f'{part} {name}'
         assert (tmp_path / 'mine').exists() and not (tmp_path / '1.replay.safetensors').exists()
-        (tmp_path / 'training_state.safetensors').unlink()
+        (tmp_path / STATE).unlink()
 
 
-def test_an_observation_that_is_not_finite_stops_the_run(tmp_path: Path) -> None:
-    trainer = Trainer(small_config(), tmp_path, Workers())
+def test_an_observation_that_is_not_finite_stops_the_run(tmp_path):
+    trainer = trainer_of(tmp_path)
     collect = trainer.collector.collect
 
-    def broken(*arguments: object) -> object:
-        episodes, success = collect(*arguments)  # type: ignore[arg-type]
+    def broken(*arguments):
+        episodes, success = collect(*arguments)
         episodes.observation[3, 20, 1] = np.inf
         return episodes, success
 
-    trainer.collector.collect = broken  # type: ignore[method-assign,assignment]
+    trainer.collector.collect = broken
     with pytest.raises(TrainingError, match='observation is not finite after 0'):
         trainer.train()
 
 
-def test_the_best_actor_is_kept_and_ties_go_to_the_better_return(tmp_path: Path) -> None:
-    trainer = Trainer(small_config(evaluation_episodes=4), tmp_path, Workers())
+def test_the_best_actor_is_kept_and_ties_go_to_the_better_return(tmp_path):
+    trainer = trainer_of(tmp_path, evaluation_episodes=4)
     episodes, success = trainer.collector.collect(trainer.learner.actor)
 
-    def evaluated(steps: int, successes: int, mean_return: float, count: int = 4) -> int:
+    def evaluated(steps, successes, mean_return, count=4):
         flags = np.arange(count) < successes
         returns = np.full(count, mean_return)
         none, nan = np.zeros(count, int), np.full(count, np.nan)
@@ -423,7 +367,7 @@ def test_the_best_actor_is_kept_and_ties_go_to_the_better_return(tmp_path: Path)
 
 
 @pytest.mark.release
-def test_two_workers_train_together(tmp_path: Path) -> None:
+def test_two_workers_train_together(tmp_path):
     run = tmp_path / 'run'
     arguments = ['--task', 'FetchReach', '--success-target', '1', '--steps', '60000', *THREADS]
     command = [sys.executable, '-m', 'torch.distributed.run', '--nproc-per-node', '2']
@@ -457,13 +401,10 @@ def test_two_workers_train_together(tmp_path: Path) -> None:
         ('--resume nowhere', 'nowhere is not the folder of a run'),
     ],
 )
-def test_bad_usage_is_one_line_and_exit_status_2(
-    arguments: str, message: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_bad_usage_is_one_line_and_exit_status_2(arguments, message, capsys, tmp_path):
     output = [] if '--resume' in arguments else ['--output', str(tmp_path)]
     assert main([*arguments.split(), *output]) == 2
-    error = capsys.readouterr().err
-    assert message in error and error.count('\n') == 1
+    assert message in one_line(capsys)
 
 
 @pytest.mark.parametrize(
@@ -488,9 +429,8 @@ def test_bad_usage_is_one_line_and_exit_status_2(
     ],
 )
 def test_a_resumed_run_rejects_changed_networks_and_experience(
-    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    Trainer(small_config(strategy='none'), tmp_path, Workers()).save()
+    arguments, message, capsys, tmp_path
+):
+    trainer_of(tmp_path, strategy='none').save()
     assert main(['--resume', str(tmp_path), *arguments]) == 2
-    error = capsys.readouterr().err
-    assert message in error and error.count('\n') == 1
+    assert message in one_line(capsys)
