@@ -600,10 +600,10 @@ def _rules(config: TrainConfig, spec: TaskSpec) -> Iterator[tuple[bool, str]]:
 def _rules_of_goals(config: TrainConfig) -> Iterator[tuple[bool, str]]:
     """Yield the rules about sources of goals."""
     c, goals, total = config, config.goals, sum(config.goals.values())
-    unknown = sorted(goals.keys() - set(SOURCES))
-    yield bool(unknown), f'goals {goals}: {unknown[:1]}; allowed: {", ".join(SOURCES)}'
+    unknown = ', '.join(map(repr, goals.keys() - set(SOURCES)))
+    yield bool(unknown), f'goals {goals}: {unknown}; allowed: {", ".join(SOURCES)}'
     yield (
-        min(goals.values(), default=1.0) <= 0.0 or total > 1.0 + 1e-9,
+        not (min(goals.values(), default=1.0) > 0.0 and total <= 1.0 + 1e-9),
         f'goals {goals}: allowed are shares above 0 that add up to at most 1',
     )
     yield bool(goals) and c.strategy == 'none', f'goals {goals} excludes strategy none'
