@@ -184,8 +184,6 @@ def evaluate(
 
     Args:
         simulation: The simulations; the result does not depend on their number.
-        episodes: Number of episodes.
-        first_seed: Seed of the first.
         hopeless: Asked after each batch; True ends the evaluation early.
     """
     outcomes: EpisodeOutcomes | None = None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import platform
 from collections.abc import Sequence
@@ -16,43 +17,19 @@ from policy_node.training.configuration.config import TrainConfig
 _MEMINFO = Path('/proc/meminfo')
 # Limit and use of a container (cgroup v2).
 _CONTAINER = Path('/sys/fs/cgroup')
-_GB = 1e9
 
 
 def available_memory() -> int | None:
     """Return the bytes that this process can allocate without swapping, or None if unknown."""
-    found = [limit for limit in (_of_the_machine(), _of_the_container()) if limit is not None]
-    return min(found, default=None)
-
-
-def why_too_large(needed: int, available: int | None) -> str:
-    """Return a warning if a replay of `needed` bytes exceeds the memory, else ''.
-
-    Linux grants memory before it is used, so a replay that is too large fails hours later.
-    """
-    if available is None or needed <= available:
-        return ''
-    return (
-        f'the replay grows to {needed / _GB:.1f} GB and {available / _GB:.1f} GB are free; '
-        'a smaller replay_transitions would fit'
-    )
-
-
-def _of_the_machine() -> int | None:
-    try:
+    found = []
+    with contextlib.suppress(OSError, StopIteration, ValueError):
         lines = _MEMINFO.read_text().splitlines()
         kilobytes = next(line.split()[1] for line in lines if line.startswith('MemAvailable:'))
-        return int(kilobytes) * 1024
-    except (OSError, StopIteration, ValueError):
-        return None
-
-
-def _of_the_container() -> int | None:
-    try:
+        found.append(int(kilobytes) * 1024)
+    with contextlib.suppress(OSError, ValueError):
         limit = int((_CONTAINER / 'memory.max').read_text())
-        return max(limit - int((_CONTAINER / 'memory.current').read_text()), 0)
-    except (OSError, ValueError):
-        return None
+        found.append(max(limit - int((_CONTAINER / 'memory.current').read_text()), 0))
+    return min(found, default=None)
 
 
 def processor() -> str:

@@ -14,7 +14,7 @@ from msgs_spec.tasks import GoalKind, TaskSpec
 from policy_node.policies.actor import Actor, Normalizer
 from policy_node.policies.network_shape import INPUT_CLIP
 from policy_node.training.configuration.config import TrainConfig
-from policy_node.training.experience.hindsight import complete_mixture, goal_mixture
+from policy_node.training.experience.hindsight import goal_mixture
 from policy_node.training.experience.replay import (
     EpisodeReplay,
     Episodes,
@@ -153,7 +153,7 @@ class Experience:
     def mixture(self) -> dict[str, float]:
         """Return the probability of each goal source."""
         config = self.config
-        return complete_mixture(config.goals) or goal_mixture(config.strategy, config.hindsight_k)
+        return goal_mixture(config.strategy, config.hindsight_k, config.goals)
 
 
 def ticks_until_dropped(

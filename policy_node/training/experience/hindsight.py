@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from msgs_spec.arrays import Array32
 from msgs_spec.rotations import quaternion_conjugate, quaternion_multiply
 from msgs_spec.tasks import GoalKind
-from policy_node.training.configuration.config import STRATEGIES
 from policy_node.training.experience.replay import Starts
 
 RewardFunction = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
@@ -25,33 +24,23 @@ Source = Callable[[Starts, np.random.Generator], Array32]
 _NEAR_TICKS = 10
 
 
-def goal_mixture(strategy: str, k: int = 4) -> dict[str, float]:
+def goal_mixture(strategy: str, k: int = 4, goals: Mapping[str, float] = {}) -> dict[str, float]:
     """Return the probability of each goal source.
 
     Args:
         strategy: `none`, `final`, `future`, `episode`, `random`: k relabelled goals for each real
             one. `futureactual`: k/2 future goals, k/2 desired goals of other episodes, 1 real goal.
-
-    Raises:
-        ValueError: If the strategy is unknown.
+        goals: Mixture instead of the strategy; the rest up to 1 keeps the goals of episodes.
     """
+    share = k / (k + 1)
+    if goals:
+        left = 1.0 - sum(goals.values())
+        return {**goals, 'real': goals.get('real', 0.0) + left} if left > 1e-9 else dict(goals)
     if strategy == 'none':
         return {'real': 1.0}
-    share = k / (k + 1)
     if strategy == 'futureactual':
         return {'future': share / 2, 'actual': share / 2, 'real': 1.0 - share}
-    if strategy not in STRATEGIES:
-        allowed = ', '.join(('none', 'futureactual', *STRATEGIES))
-        raise ValueError(f'strategy {strategy!r}; allowed: {allowed}')
     return {strategy: share, 'real': 1.0 - share}
-
-
-def complete_mixture(goals: dict[str, float]) -> dict[str, float]:
-    """Return the mixture with the rest up to 1 for the goals of episodes; empty stays empty."""
-    left = 1.0 - sum(goals.values())
-    if not goals or left <= 1e-9:
-        return dict(goals)
-    return {**goals, 'real': goals.get('real', 0.0) + left}
 
 
 def draw_sources(

@@ -58,7 +58,6 @@ class EpisodeReplay:
     Linux grants the memory as episodes arrive.
 
     Args:
-        capacity: Largest number of episodes.
         weigh: Weights of episodes for `draw`.
         count_ticks: Number of ticks of each episode that may be drawn, from its first; None is
             all of them.

@@ -67,14 +67,6 @@ def _scaled(config: TrainConfig, scale: float) -> TrainConfig:
 class ImitationTrainer(BaseTrainer):
     """One run of imitation.
 
-    Args:
-        config: The configuration.
-        output: Folder of the run.
-        workers: One worker.
-        command: Command line, for the metadata of actors.
-        source_revision: Git revision of the source, for the metadata of actors.
-        init_from: The policy to imitate.
-
     Raises:
         ValueError: With several workers, or if `value_weight` needs a critic and there is none.
     """

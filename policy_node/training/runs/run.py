@@ -29,7 +29,6 @@ from policy_node.training.machine import (
     is_first_worker,
     join_workers,
     leave_workers,
-    why_too_large,
 )
 from policy_node.training.runs.imitation import ImitationTrainer
 from policy_node.training.runs.initial_networks import InitialNetworks, read_initial_networks
@@ -134,19 +133,23 @@ def train_run(
         RunTakenError: If another process trains in the folder.
         TrainingError: If training fails; the last checkpoint stays.
     """
-    networks = _initial_networks(config) if config.init_from and not resume else None
+    networks = None
+    if config.init_from and not resume:
+        networks = read_initial_networks(config.init_from).fitted(config)
+        if not networks.critics and config.algorithm != 'imitation':
+            complain(NAME, f'{config.init_from} has no critic for this run; a new one learns first')
     with lock_run(output) if is_first_worker() else contextlib.nullcontext():
         if not resume and (output / STATE_FILE).exists():
             raise ValueError(f'{output} contains a run. Use --resume or choose another folder')
         trainer = _make_trainer(config, output, command, networks, resume, experience)
-        if isinstance(trainer, Trainer) and (why := _too_large(trainer)):
-            complain(NAME, why)
+        if isinstance(trainer, Trainer):
+            _warn_of_memory(trainer)
         try:
             ending = _train(trainer, output, command, caller, resume=resume)
         except (TrainingError, OSError) as error:
-            is_kept = (output / STATE_FILE).is_file()
-            kept = f'the last checkpoint is in {output}'
-            note = kept if is_kept else f'{output} contains no checkpoint'
+            note = f'{output} contains no checkpoint'
+            if (output / STATE_FILE).is_file():
+                note = f'the last checkpoint is in {output}'
             raise TrainingError(f'{error}; {note}') from None
         finally:
             leave_workers(trainer.workers)
@@ -159,13 +162,6 @@ def train_run(
             except OSError as error:
                 complain(NAME, f'no curve, the run itself is saved: {error}')
         return ending
-
-
-def _initial_networks(config: TrainConfig) -> InitialNetworks:
-    networks = read_initial_networks(config.init_from).fitted(config)
-    if not networks.critics and config.algorithm != 'imitation':
-        complain(NAME, f'{config.init_from} has no critic for this run; a new one learns first')
-    return networks
 
 
 def _make_trainer(
@@ -200,13 +196,21 @@ def _make_trainer(
     return trainer
 
 
-def _too_large(trainer: Trainer) -> str:
-    """Return a warning if the replay will exceed the memory of this worker hours later."""
-    replay = trainer.experience.replay
+def _warn_of_memory(trainer: Trainer) -> None:
+    """Warn if the replay will exceed the memory of this worker hours later.
+
+    Linux grants memory before it is used.
+    """
+    replay, available = trainer.experience.replay, available_memory()
     left = max(trainer.config.total_steps - trainer.counters.env_steps, 0)
     episodes = len(replay) + trainer.workers.share(left) // replay.ticks
     needed = replay.bytes_of(episodes) - replay.bytes_of(len(replay))
-    return why_too_large(needed, available_memory())
+    if available is not None and needed > available:
+        complain(
+            NAME,
+            f'the replay grows to {needed / 1e9:.1f} GB and {available / 1e9:.1f} GB are free; '
+            'a smaller replay_transitions would fit',
+        )
 
 
 def _train(

@@ -47,14 +47,6 @@ def ship(
 ) -> bool:
     """Evaluate an actor of a run and copy it with its files if it beats the shipped actor.
 
-    Args:
-        run: Folder of the run.
-        actors: Folder of the shipped actors.
-        episodes: Number of new episodes.
-        num_envs: Simulations in the batch.
-        threads: Simulation threads; 0 means all cores.
-        name: File of the actor in the run.
-
     Returns:
         Whether the actor is now shipped.
 
@@ -158,7 +150,10 @@ def _write(candidate: _Candidate, target: Path, summary: dict[str, Any]) -> None
     curve = target.with_suffix('.png')
     # A mean of networks has no curve of its own; the old one stays.
     if candidate.progress[-1].get('updates') or not curve.is_file():
-        files[curve] = _curve_bytes(candidate)
+        picture, recipe = BytesIO(), info.config.get('recipe', 'an unknown')
+        title = f'{info.task}, {recipe} recipe, seed {info.seed}'
+        draw_curve(candidate.progress, title, picture)
+        files[curve] = picture.getvalue()
     report = {
         'actor': candidate.name,
         'sha256': sha256(actor),
@@ -177,13 +172,6 @@ def _write(candidate: _Candidate, target: Path, summary: dict[str, Any]) -> None
     if candidate.state is None:
         # Remove the critic of the former actor.
         companion_file(target).unlink(missing_ok=True)
-
-
-def _curve_bytes(candidate: _Candidate) -> bytes:
-    info, picture = candidate.info, BytesIO()
-    recipe = info.config.get('recipe', 'an unknown')
-    draw_curve(candidate.progress, f'{info.task}, {recipe} recipe, seed {info.seed}', picture)
-    return picture.getvalue()
 
 
 def _critic_bytes(state: TrainingState, actor_sha256: str) -> bytes:

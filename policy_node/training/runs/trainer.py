@@ -46,15 +46,14 @@ from policy_node.training.runs.training_state import (
     fitting,
     load_networks,
     load_state,
-    require_finite_episodes,
-    require_finite_losses,
-    require_finite_networks,
+    require_finite,
     require_readable,
 )
 
 Candidate = tuple[Actor, dict[str, Policy]]
 """An actor to evaluate, and policies beside it by column of `progress.csv`."""
 
+_LOSSES = ('critic', 'actor')
 # Largest number of steps that a resumed run without its replay collects before it learns.
 MOST_REFILLED = 100_000
 
@@ -349,7 +348,9 @@ class Trainer(BaseTrainer):
 
     def _finished(self, job: Future[Collected]) -> Collected:
         collected = job.result()
-        require_finite_episodes(collected.episodes, self.counters)
+        require_finite(
+            ((n, getattr(collected.episodes, n)) for n in Episodes.__slots__), self.counters
+        )
         return collected
 
     def _store(self, collected: Collected) -> None:
@@ -382,8 +383,11 @@ class Trainer(BaseTrainer):
         self.learner.average()
         self.counters.updates = self.learner.updates
         # Check before acting or saving.
-        require_finite_losses(losses, self.counters)
-        require_finite_networks(self.learner.modules(), self.counters)
+        named = [(f'{n} loss', torch.tensor([getattr(x, n) for x in losses])) for n in _LOSSES]
+        # The loss before the last step may be finite and the weights after it not.
+        for part, module in self.learner.modules().items():
+            named += [(f'{part}.{n}', value.cpu()) for n, value in module.state_dict().items()]
+        require_finite(named, self.counters)
         return losses
 
     def _keep_best(self, collected: Collected) -> None:

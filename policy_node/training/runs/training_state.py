@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -23,8 +23,7 @@ from policy_node.policies.files import (
     write_file,
 )
 from policy_node.training.configuration.config import Limits
-from policy_node.training.experience.replay import Episodes
-from policy_node.training.learners.actor_critic import ActorCritic, Losses
+from policy_node.training.learners.actor_critic import ActorCritic
 
 FORMAT = 'fetch_hand_training'
 FORMAT_VERSION = 1
@@ -167,8 +166,9 @@ def read_state(path: Path) -> TrainingState:
     arrays, metadata = read_tensors(path)
     counters, extra = _described(path, metadata)
     tensors = {name: torch.tensor(values) for name, values in arrays.items()}
-    if name := first_not_finite(tensors):
-        raise ValueError(f'{path} is damaged: {name} has a value that is not finite')
+    for name, value in arrays.items():
+        if not np.isfinite(value).all():
+            raise ValueError(f'{path} is damaged: {name} has a value that is not finite')
     return TrainingState(tensors, counters, extra)
 
 
@@ -206,14 +206,6 @@ def _counters(values: Any) -> Counters:
 def is_finite(value: object) -> TypeGuard[int | float]:
     """Return whether a value from a file is a finite number; booleans are not."""
     return isinstance(value, int | float) and type(value) is not bool and math.isfinite(value)
-
-
-def first_not_finite(tensors: Mapping[str, Tensor]) -> str:
-    """Return the name of the first tensor with a value that is not finite, or ''."""
-    for name, value in tensors.items():
-        if value.is_floating_point() and not torch.isfinite(value).all():
-            return name
-    return ''
 
 
 def load_state(path: Path, learner: ActorCritic, modules: dict[str, nn.Module]) -> TrainingState:
@@ -314,34 +306,11 @@ class TrainingError(RuntimeError):
     """Training cannot continue; the message contains the step and the cause."""
 
 
-def require_finite_episodes(episodes: Episodes, counters: Counters) -> None:
-    """Raise `TrainingError` if an episode has a value that is not finite."""
-    for name in ('observation', 'achieved_goal', 'desired_goal', 'action'):
-        if not np.isfinite(getattr(episodes, name)).all():
+def require_finite(values: Iterable[tuple[str, Any]], counters: Counters) -> None:
+    """Raise `TrainingError` if one of the named arrays or tensors is not finite."""
+    for name, value in values:
+        if not np.isfinite(value).all():
             raise TrainingError(
-                f'{name} is not finite after {counters.env_steps} environment steps'
-            )
-
-
-def require_finite_losses(losses: Sequence[Losses], counters: Counters) -> None:
-    """Raise `TrainingError` if a loss of the newest updates is not finite."""
-    first = counters.updates - len(losses)
-    for name in ('critic', 'actor'):
-        values = [getattr(loss, name) for loss in losses]
-        finite = torch.isfinite(torch.stack(values)).tolist() if values else []
-        if not all(finite):
-            index = finite.index(False)
-            raise TrainingError(
-                f'{name} loss is {float(values[index])} in update {first + index + 1}, '
-                f'after {counters.env_steps} environment steps'
-            )
-
-
-def require_finite_networks(modules: Mapping[str, nn.Module], counters: Counters) -> None:
-    """Raise `TrainingError` if a weight is not finite; the loss may still have been finite."""
-    for name, module in modules.items():
-        if key := first_not_finite(module.state_dict()):
-            raise TrainingError(
-                f'{name}.{key} is not finite after update {counters.updates}, '
-                f'after {counters.env_steps} environment steps'
+                f'{name} is not finite after {counters.env_steps} environment steps and '
+                f'{counters.updates} updates'
             )
