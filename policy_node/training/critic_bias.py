@@ -58,12 +58,8 @@ def _run(options: argparse.Namespace) -> int:
     for name in ('tick', 'value', 'return', 'difference', 'correlation'):
         table.add_column(name, justify='right')
     for each in comparisons:
-        numbers = (
-            each.value,
-            each.episode_return,
-            each.value - each.episode_return,
-            each.correlation,
-        )
+        value, total = each.value, each.episode_return
+        numbers = (value, total, value - total, each.correlation)
         table.add_row(str(each.tick), *(f'{number:.2f}' for number in numbers))
     Console().print(table)
     return EXIT_SUCCESS

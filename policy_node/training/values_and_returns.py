@@ -10,18 +10,15 @@ import torch
 from numpy.typing import NDArray
 
 from fetch_hand_sim.simulation import Simulation
-from policy_node.training.configuration.config import DEFAULTS, TrainConfig
-from policy_node.training.configuration.flat import changed, config_from_dict, to_flat
+from policy_node.training.configuration.config import changed_fields
+from policy_node.training.configuration.flat import changed, config_from_dict
 from policy_node.training.evaluation import FIRST_SEED
 from policy_node.training.experience.hindsight import RewardFunction
 from policy_node.training.learners.actor_critic import ActorCritic
 from policy_node.training.machine import Workers
-from policy_node.training.research.registry import (
-    make_learner,
-    make_sampler,
-    make_simulation,
-)
+from policy_node.training.research.registry import make_sampler
 from policy_node.training.runs.run_folder import STATE_FILE
+from policy_node.training.runs.trainer import Trainer
 from policy_node.training.runs.training_state import load_state, read_state
 
 # Rewards after the episode are taken as the mean of its last ticks.
@@ -34,13 +31,11 @@ _OTHER_VALUES = ('algorithm', 'longest_hold', 'advantage', 'subgoal_every', 'con
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """Values and returns from one tick on.
+    """Means over the episodes from one tick on; the correlation is NaN if one is constant.
 
     Attributes:
-        tick: The tick.
-        value: Value of the actor's action, mean over the episodes.
-        episode_return: Discounted training rewards from this tick on, mean over the episodes.
-        correlation: Correlation of both over the episodes; NaN if one is constant.
+        value: Value of the actor's action.
+        episode_return: Discounted training rewards.
     """
 
     tick: int
@@ -55,35 +50,21 @@ def measure(run: Path, episodes: int) -> list[Comparison]:
     Raises:
         ValueError: If the folder contains no run, or its values are not those of actions.
     """
-    config, progress = _read_config(run / STATE_FILE)
-    simulation = make_simulation(config, episodes, 0)
-    sampler = make_sampler(config, simulation.metric)
-    learner, experience = make_learner(
-        config,
-        simulation.spec,
-        torch.device('cpu'),
-        Workers(),
-        sampler,
-        np.random.default_rng(0),
-    )
-    load_state(run / STATE_FILE, learner, {**learner.modules(), **experience.statistics})
-    values, rewards = _play(simulation, learner, sampler.at(progress).compute_reward)
+    state = read_state(run / STATE_FILE)
+    config = config_from_dict(state.extra['config'])
+    if odd := changed_fields(config, _OTHER_VALUES):
+        raise ValueError(f'{run} has no values of actions: {", ".join(odd)}')
+    few = {'num_envs': episodes, 'evaluation_episodes': 1, 'replay_transitions': 1}
+    config = changed(config, **few, learning_starts=0, device='cpu')
+    trainer = Trainer(config, run, Workers())
+    load_state(run / STATE_FILE, trainer.learner, trainer.modules())
+    sampler = make_sampler(config, trainer.simulation.metric)
+    progress = state.counters.env_steps / config.total_steps
+    compute_reward = sampler.at(progress).compute_reward
+    values, rewards = _play(trainer.simulation, trainer.learner, compute_reward)
     returns = discounted(rewards * sampler.reward_scale, config.tick_gamma)
     ticks = [int(share * len(values)) for share in _SHARES]
     return [_compared(tick, values[tick], returns[tick]) for tick in ticks]
-
-
-def _read_config(file: Path) -> tuple[TrainConfig, float]:
-    """Return the configuration of a run and its progress, 0 to 1."""
-    state = read_state(file)
-    config = config_from_dict(state.extra['config'])
-    flat = to_flat(config)
-    found = {name: flat[name] for name in _OTHER_VALUES}
-    odd = [f'{name} {value}' for name, value in found.items() if value != DEFAULTS[name]]
-    if odd:
-        raise ValueError(f'{file.parent} has no values of actions: {", ".join(odd)}')
-    config = changed(config, replay_transitions=1, learning_starts=0, device='cpu')
-    return config, state.counters.env_steps / config.total_steps
 
 
 def _play(

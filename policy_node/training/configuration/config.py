@@ -476,7 +476,7 @@ GAMBLE_TASKS = ('FetchReach', 'FetchPush')
 _ALTERNATIVES = ('n_step', 'longest_hold', 'advantage', 'condition', 'importance', 'goal_choice')
 
 
-def _changed(config: TrainConfig, names: typing.Iterable[str]) -> list[str]:
+def changed_fields(config: TrainConfig, names: typing.Iterable[str]) -> list[str]:
     """Return the fields among these, as `name value`, that differ from their default."""
     values = {name: getattr(config, name) for name in names}
     return [f'{name} {value}' for name, value in values.items() if value != DEFAULTS[name]]
@@ -485,7 +485,9 @@ def _changed(config: TrainConfig, names: typing.Iterable[str]) -> list[str]:
 def unusual_networks(config: TrainConfig) -> list[str]:
     """Return the fields, as `name value`, whose networks no other kind of run can start from."""
     learner = () if config.algorithm == 'imitation' else ('algorithm',)
-    return _changed(config, (*learner, 'longest_hold', 'advantage', 'subgoal_every', 'quantiles'))
+    return changed_fields(
+        config, (*learner, 'longest_hold', 'advantage', 'subgoal_every', 'quantiles')
+    )
 
 
 def _rules(config: TrainConfig, spec: TaskSpec) -> Iterator[tuple[bool, str]]:
@@ -534,7 +536,7 @@ def _rules(config: TrainConfig, spec: TaskSpec) -> Iterator[tuple[bool, str]]:
         c.algorithm == 'imitation' and not c.init_from,
         'algorithm imitation needs init_from, the policy to imitate',
     )
-    unusual, chosen = unusual_networks(c), _changed(c, _ALTERNATIVES)
+    unusual, chosen = unusual_networks(c), changed_fields(c, _ALTERNATIVES)
     yield bool(c.init_from and unusual), f'init_from excludes {", ".join(unusual)}'
     yield len(chosen) > 1, f'{" excludes ".join(chosen)}'
     yield (
@@ -559,13 +561,13 @@ def _rules(config: TrainConfig, spec: TaskSpec) -> Iterator[tuple[bool, str]]:
         and (
             c.discount != 'time'
             or c.norm == 'batch'
-            or bool(_changed(c, ('critics', 'aggregate', 'quantiles')))
+            or bool(changed_fields(c, ('critics', 'aggregate', 'quantiles')))
         ),
         'advantage needs discount time and one critic of its mean, without norm batch',
     )
     yield (
         c.subgoal_prior > 0.0
-        and bool(_changed(c, ('longest_hold', 'advantage', 'condition', 'importance'))),
+        and bool(changed_fields(c, ('longest_hold', 'advantage', 'condition', 'importance'))),
         'subgoal_prior excludes longest_hold, advantage, condition and importance',
     )
     yield (

@@ -152,6 +152,8 @@ def test_bad_assignments_are_refused(text, match):
         ({'reward_grades': '2,1'}, 'rising numbers above 0 and below 1000'),
         ({'reward_grades': 'all'}, "reward_grades 'all' is not numbers"),
         ({'reward_grades': '1,2', 'condition': 'threshold'}, 'condition excludes reward_grades'),
+        ({**PEN, 'ticks_after_drop': -1, 'drop_is_lost': True}, 'needs ticks_after_drop'),
+        ({**PEN, 'drop_is_lost': True, 'reward_type': 'dense'}, 'needs reward_type sparse'),
         ({**PEN, 'drop_is_lost': True, 'condition': 'horizon'}, 'it excludes condition horizon'),
         ({'trace': 0.5}, 'trace 0.5 has no effect'),
         ({'retry_failed': 0.5}, 'unknown configuration fields: retry_failed'),

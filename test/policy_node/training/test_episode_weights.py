@@ -54,22 +54,6 @@ def test_every_valid_transition_is_as_likely_as_any_other():
     assert np.bincount(row) / 22_000 == pytest.approx([2 / 22, 10 / 22, 10 / 22], abs=0.012)
 
 
-def test_weights_decide_their_share_of_a_draw():
-    def weigh(episodes):
-        return episodes.achieved_goal[:, 0, 0].astype(float)
-
-    replay, generator = EpisodeReplay(4, TICKS, 3, 3, 1, weigh=weigh), np.random.default_rng(0)
-    achieved = np.zeros((4, TICKS + 1, 3))
-    replay.add(episodes_of(achieved))
-    assert set(replay.draw(1000, 1.0, generator)) == {0, 1, 2, 3}, 'no weight has no effect'
-    achieved[:, :, 0] = np.array([0, 1, 3, 0])[:, None]
-    replay.add(episodes_of(achieved))
-    drawn = np.bincount(replay.draw(20_000, 1.0, generator), minlength=4) / 20_000
-    assert drawn == pytest.approx([0, 1 / 4, 3 / 4, 0], abs=0.012)
-    drawn = np.bincount(replay.draw(20_000, 0.5, generator), minlength=4) / 20_000
-    assert drawn == pytest.approx([1 / 8, 1 / 4, 1 / 2, 1 / 8], abs=0.012)
-
-
 def pen_episodes(achieved):
     """Episodes of these poses, seen as they are; the first value observed is the tick."""
     count = len(achieved)
@@ -145,9 +129,3 @@ def test_a_drop_that_is_lost_is_worth_minus_one_for_ever(n_step, source):
     worth = -10.0 + 0.9 ** (goal - tick - 1.0) * (source == 'future')
     np.testing.assert_allclose(batch.reward[ends], worth[ends], rtol=1e-5)
     assert len(set(batch.reward[~ends])) > n_step, 'goals are met where nothing is lost as well'
-
-
-@pytest.mark.parametrize('changes', [{}, {'ticks_after_drop': 2, 'reward_type': 'dense'}])
-def test_a_loss_needs_a_drop_and_sparse_rewards(changes):
-    with pytest.raises(ValueError, match=r'drop_is_lost .*(ticks_after_drop|reward_type sparse)'):
-        recipe_config('HandManipulatePenRotate', 'best', drop_is_lost=True, **changes)

@@ -55,16 +55,6 @@ class Judge:
         return batch.goal[:, 0]
 
 
-def test_a_return_sums_discounted_rewards_and_bootstraps_where_it_ends(walk):
-    batch = draw(walk, TransitionSampler(at_goal, 0.5, 3))
-    first, last = batch.observation[:, 0], batch.next_observation[:, 0]
-    assert (last == np.minimum(first + 3, TICKS)).all(), 'never beyond the episode'
-    np.testing.assert_allclose(batch.discount, 0.5 ** (last - first))
-    # From place 2 the goal 4 is the second step of three; from 4 on it was left again.
-    expected = {0.0: -1.75, 1.0: -1.5, 2.0: -1.25, 3.0: -0.75, 4.0: -1.5, 5.0: -1.0}
-    assert {float(p): float(r) for p, r in zip(first, batch.reward, strict=True)} == expected
-
-
 def test_several_steps_of_one_are_one_step(walk):
     sampler = TransitionSampler(at_goal, 0.9)
     starts = Starts(walk, np.repeat(np.arange(20), TICKS), np.tile(np.arange(TICKS), 20))
