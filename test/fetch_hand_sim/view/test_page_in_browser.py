@@ -202,11 +202,20 @@ def open_section(browser: Browser, header: float, before: np.ndarray) -> None:
     raise AssertionError(f'nothing opens at {header}')
 
 
+SIM_NODE = (
+    *(sys.executable, '-m', 'fetch_hand_sim.sim_node'),
+    *ros_args(task='FetchReach', perturb_limit=50.0),
+)
+
+
 @pytest.fixture
-def robot(start_process):
-    """A robot that nobody commands and everybody may push, and a client that hears it."""
-    parameters = ros_args(task='FetchReach', perturb_limit=50.0)
-    start_process(sys.executable, '-m', 'fetch_hand_sim.sim_node', *parameters)
+def robot_process(start_process):
+    return start_process(*SIM_NODE)
+
+
+@pytest.fixture
+def robot(robot_process):
+    """A client of a robot that nobody commands and everybody may push."""
     with client(TASKS['FetchReach']) as connection:
         connection.subscribe(
             'desired_goal', 'episode_status', 'achieved_goal', 'applied_command', 'joint_states'
@@ -415,6 +424,23 @@ def test_a_page_that_is_no_longer_seen_lets_go_of_the_robot(browser, start_proce
         next_one.wait_for_frames(10)
         robot.spin(1.0)
         assert robot.node.count_publishers('/commands') == 0
+
+
+def test_old_sliders_do_not_command_a_new_robot(browser, start_process, robot_process, robot):
+    browser.open(address_of(start_process(*VIEW)))
+    take_over(browser, robot)
+    browser.press_key('ArrowRight')
+    wait_for_moves(robot, [1.0, 0.0, 0.0])
+    robot_process.kill()
+    robot_process.wait()
+    wait_for_no_commander(robot)
+    robot.received['joint_states'].clear()
+    start_process(*SIM_NODE)
+    robot.spin_until(lambda: len(robot.received['joint_states']) > 25, 'new robot', PATIENCE)
+    browser.wait(2.0)
+    robot.spin(2.0)
+    assert robot.node.count_publishers('/commands') == 0
+    assert np.allclose(latest(robot, 'applied_command'), 0.0)
 
 
 def test_dragging_the_goal_moves_it_and_the_actor_gets_there(browser, start_process, robot):
