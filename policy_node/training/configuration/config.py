@@ -44,7 +44,7 @@ Count = Annotated[int, Range(0, 1024)]
 
 @dataclass(frozen=True, kw_only=True)
 class Start:
-    """What is trained."""
+    """Task, recipe, seed and algorithm."""
 
     task: str
     """Task name, `FetchReach`, ..."""
@@ -213,7 +213,7 @@ class Critics:
 
 @dataclass(frozen=True, kw_only=True)
 class Values:
-    """What the critics learn."""
+    """Values that the critics learn."""
 
     n_step: Annotated[int, Range(1, 100)] = 1
     """Most steps of a return before it bootstraps."""

@@ -130,7 +130,7 @@ def _start(
     return {**result, 'points': earlier_points}
 
 
-# What a worker process evaluates with: options, simulation and policy.
+# Options, simulation and policy of a worker process.
 _worker: list[Any] = []
 
 

@@ -68,7 +68,7 @@ class ImitationTrainer(BaseTrainer):
     """One run of imitation.
 
     Raises:
-        ValueError: With several workers, or if `value_weight` needs a critic and there is none.
+        ValueError: With several workers, or if the critic for `value_weight` is missing.
     """
 
     def __init__(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,6 @@ from typing import Any
 from fetch_hand_sim.simulation import Simulation
 from node_runtime.signals import discard_unread_output
 from policy_node.policies import checkpoint
-from policy_node.policies.actor import Actor
 from policy_node.policies.checkpoint import ActorInfo
 from policy_node.policies.files import sha256, to_json, write_files
 from policy_node.policies.loading import ROBUST, shipped_name
@@ -56,11 +55,17 @@ def ship(
             chance.
         UsageError: If the folder cannot be written.
     """
-    candidate = _read_candidate(run, name)
-    target = actors / f'{candidate.name}.safetensors'
-    _require_rate(target, candidate.info.control_hz)
-    old = _read_evaluation(target.with_suffix('.json'))
-    if (old.get('run_sha256'), old.get('episodes')) == (candidate.sha256, episodes):
+    actor, info = checkpoint.load(run / name)
+    progress = _read_log(run / PROGRESS_FILE)
+    state = read_state(run / STATE_FILE) if (run / STATE_FILE).is_file() else None
+    is_robust = info.config.get('recipe') == ROBUST
+    target = actors / f'{shipped_name(info.task, ROBUST if is_robust else "")}.safetensors'
+    _require_rate(target, info.control_hz)
+    old, digest = (
+        _read_evaluation(target.with_suffix('.json')),
+        checkpoint.checkpoint_hash(run / name),
+    )
+    if (old.get('run_sha256'), old.get('episodes')) == (digest, episodes):
         print(f'ship_actor: {target} is already this actor')
         return True
     if old and old['episodes'] > episodes:
@@ -69,107 +74,77 @@ def ship(
             f'give --episodes {old["episodes"]} or more'
         )
     require_writable(target)
-    summary = _evaluate(candidate, episodes, num_envs, threads)
+    # The evaluation repeats the disturbances of the training.
+    disturbances = info.config.get('disturbances') or None
+    simulation = Simulation(
+        info.task,
+        num_envs=min(num_envs, episodes),
+        num_threads=threads,
+        control_hz=info.control_hz,
+        disturbances=disturbances,
+    )
+    summary = summarize(evaluate(simulation, actor, episodes, FIRST_SEED))
+    # A closed terminal must not stop the copy.
+    discard_unread_output()
+    print_table({'policy': str(run), 'task': info.task, **summary})
     if old and [summary[key] for key in _BETTER] <= [old[key] for key in _BETTER]:
         print(f'ship_actor: {target} is at least as good; it stays')
         return False
-    _write(candidate, target, summary)
+    if (run / COMMAND_FILE).is_file():
+        # Every command of the run in order, each once.
+        commands = dict.fromkeys((run / COMMAND_FILE).read_text().splitlines())
+        info = replace(info, command=' && '.join(commands))
+    shipped = checkpoint.to_bytes(actor, replace(info, success=summary))
+    report = {
+        'actor': target.stem,
+        'sha256': sha256(shipped),
+        'run_sha256': digest,
+        'env_steps': info.env_steps,
+        'command': info.command,
+        'init_from': info.init_from,
+        'source_revision': info.source_revision,
+        **({'disturbances': disturbances} if disturbances else {}),
+        **summary,
+    }
+    _write(target, shipped, report, state, progress, info)
     print(f'ship_actor: {target} is now the actor of {run}')
     return True
 
 
-@dataclass(frozen=True, slots=True)
-class _Candidate:
-    """An actor of a run, with log and state of the run; the state may be missing."""
-
-    run: Path
-    actor: Actor
-    info: ActorInfo
-    sha256: str
-    progress: list[dict[str, float]]
-    state: TrainingState | None
-
-    @property
-    def name(self) -> str:
-        """Name of the shipped file: the task, with `_robust` for that recipe."""
-        is_robust = self.info.config.get('recipe') == ROBUST
-        return shipped_name(self.info.task, ROBUST if is_robust else '')
-
-    @property
-    def disturbances(self) -> str | None:
-        """Disturbances of its training, which its evaluation repeats."""
-        return self.info.config.get('disturbances') or None
-
-    @property
-    def command(self) -> str:
-        """Every command of the run in order, each once."""
-        path = self.run / COMMAND_FILE
-        if not path.is_file():
-            return self.info.command
-        return ' && '.join(dict.fromkeys(path.read_text().splitlines()))
-
-
-def _read_candidate(run: Path, name: str) -> _Candidate:
-    """Read all files before the evaluation; raise ValueError if one is missing or damaged."""
-    actor, info = checkpoint.load(run / name)
-    log, state = run / PROGRESS_FILE, run / STATE_FILE
+def _read_log(log: Path) -> list[dict[str, float]]:
+    """Return the rows of the log of a run; raise ValueError if it is missing or has none."""
     try:
         progress = read_progress(log)
     except OSError as error:
         raise ValueError(f'{log} cannot be read: {error.strerror}') from None
     if not progress:
         raise ValueError(f'{log} has no row')
-    digest = checkpoint.checkpoint_hash(run / name)
-    found = read_state(state) if state.is_file() else None
-    return _Candidate(run, actor, info, digest, progress, found)
+    return progress
 
 
-def _evaluate(candidate: _Candidate, episodes: int, num_envs: int, threads: int) -> dict[str, Any]:
-    info = candidate.info
-    simulation = Simulation(
-        info.task,
-        num_envs=min(num_envs, episodes),
-        num_threads=threads,
-        control_hz=info.control_hz,
-        disturbances=candidate.disturbances,
-    )
-    summary = summarize(evaluate(simulation, candidate.actor, episodes, FIRST_SEED))
-    # A closed terminal must not stop the copy.
-    discard_unread_output()
-    print_table({'policy': str(candidate.run), 'task': info.task, **summary})
-    return summary
-
-
-def _write(candidate: _Candidate, target: Path, summary: dict[str, Any]) -> None:
+def _write(
+    target: Path,
+    actor: bytes,
+    report: dict[str, Any],
+    state: TrainingState | None,
+    progress: list[dict[str, float]],
+    info: ActorInfo,
+) -> None:
     """Write the actor with critic, curve and evaluation: all or none."""
-    info = replace(candidate.info, success=summary, command=candidate.command)
-    actor = checkpoint.to_bytes(candidate.actor, info)
     files = {target: actor}
-    if candidate.state is not None:
-        files[companion_file(target)] = _critic_bytes(candidate.state, sha256(actor))
+    if state is not None:
+        files[companion_file(target)] = _critic_bytes(state, sha256(actor))
     curve = target.with_suffix('.png')
     # A mean of networks has no curve of its own; the old one stays.
-    if candidate.progress[-1].get('updates') or not curve.is_file():
+    if progress[-1].get('updates') or not curve.is_file():
         picture, recipe = BytesIO(), info.config.get('recipe', 'an unknown')
-        title = f'{info.task}, {recipe} recipe, seed {info.seed}'
-        draw_curve(candidate.progress, title, picture)
+        draw_curve(progress, f'{info.task}, {recipe} recipe, seed {info.seed}', picture)
         files[curve] = picture.getvalue()
-    report = {
-        'actor': candidate.name,
-        'sha256': sha256(actor),
-        'run_sha256': candidate.sha256,
-        'env_steps': info.env_steps,
-        'command': info.command,
-        'init_from': info.init_from,
-        'source_revision': info.source_revision,
-        **({'disturbances': candidate.disturbances} if candidate.disturbances else {}),
-        **summary,
-    }
     # The last file: without it the actor is shipped again.
     files[target.with_suffix('.json')] = to_json(report)
     # Links stay links.
     write_files({path.resolve(): data for path, data in files.items()})
-    if candidate.state is None:
+    if state is None:
         # Remove the critic of the former actor.
         companion_file(target).unlink(missing_ok=True)
 

@@ -70,7 +70,7 @@ class Collected:
 
 
 class BaseTrainer:
-    """What every run has: simulations, folder, counters and an end.
+    """Parts of every run: simulations, folder, counters and end.
 
     Args:
         origin: Origin of the first networks; empty if they are random.

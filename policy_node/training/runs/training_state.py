@@ -309,7 +309,7 @@ class TrainingError(RuntimeError):
 def require_finite(values: Iterable[tuple[str, Any]], counters: Counters) -> None:
     """Raise `TrainingError` if one of the named arrays or tensors is not finite."""
     for name, value in values:
-        if not np.isfinite(value).all():
+        if not np.isfinite(np.asarray(value)).all():
             raise TrainingError(
                 f'{name} is not finite after {counters.env_steps} environment steps and '
                 f'{counters.updates} updates'

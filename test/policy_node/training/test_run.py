@@ -27,7 +27,7 @@ from policy_node.training.runs.run import lock_run
 from policy_node.training.runs.run_log import read_progress
 from policy_node.training.train_her import main
 from support.full_disk import files_at_most
-from support.runs import SMALL, STATE, one_line, options_of, resumed, trained, trainer_of
+from support.runs import SMALL, STATE, one_line, options_of, resumed, trained, trainer_of, weights
 
 SET = options_of(**SMALL | {'evaluate_every': 1_000})
 REACH = ['--task', 'FetchReach', *SET]
@@ -128,7 +128,10 @@ def test_a_finished_run_is_not_trained_any_further_but_with_more_steps(tmp_path,
     assert '1,200 environment steps done before; give another total_steps' in said
     assert (run / STATE).read_bytes() == before
     assert main(['--resume', str(run), '--steps', '2000']) == 0
-    assert [row['updates'] for row in read_progress(run / 'progress.csv')] == [4, 8, 12, 16, 20]
+    rows = [(row['env_steps'], row['updates']) for row in read_progress(run / 'progress.csv')]
+    assert rows == [(400, 4), (800, 8), (1200, 12), (1600, 16), (2000, 20)]
+    assert weights(run / STATE)['observation_statistics.count'] == 2000
+    assert checkpoint.read_info(run / 'latest.safetensors').env_steps == 2000
 
 
 @pytest.mark.parametrize(

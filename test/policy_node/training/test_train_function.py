@@ -28,8 +28,16 @@ from policy_node.training import Run, train  # noqa: E402
 SMALL = runs.SMALL | {'quiet': True}
 
 
-def test_a_run_leaves_an_actor_and_its_curve(tmp_path, capfd):
+def test_a_run_leaves_an_actor_its_curve_and_the_state_of_torch(tmp_path, capfd):
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    torch.manual_seed(3)
+    expected = torch.rand(1)
+    torch.manual_seed(3)
     run = train('FetchReach', tmp_path / 'run', total_steps=1_200, **SMALL)
+    found = torch.rand(1), torch.get_num_threads()
+    torch.set_num_threads(before)
+    assert found == (expected, 2)
     assert isinstance(run, Run)
     assert (run.env_steps, run.reason) == (1_200, '1,200 environment steps done')
     assert load_policy(run.actor).task == 'FetchReach'
@@ -88,20 +96,6 @@ def test_the_function_trains_as_the_command(tmp_path):
         for folder in (run.folder, tmp_path / 'command')
     )
     assert ours.tolist() == theirs.tolist()
-
-
-def test_the_program_around_it_keeps_its_threads_and_random_numbers(tmp_path):
-    before = torch.get_num_threads()
-    try:
-        torch.set_num_threads(2)
-        torch.manual_seed(3)
-        expected = torch.rand(1)
-        torch.manual_seed(3)
-        train('FetchReach', tmp_path / 'run', total_steps=400, **SMALL)
-        assert torch.rand(1) == expected
-        assert torch.get_num_threads() == 2
-    finally:
-        torch.set_num_threads(before)
 
 
 def test_a_callback_sees_every_cycle_and_may_end_the_run(tmp_path):

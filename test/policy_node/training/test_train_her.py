@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import os
 import subprocess
@@ -83,22 +82,6 @@ def test_the_same_seed_gives_the_same_weights_bit_for_bit(tmp_path, overlap):
     for name in (latest, STATE):
         assert same(weights(tmp_path / 'a' / name), weights(tmp_path / 'b' / name))
     assert not same(weights(tmp_path / 'a' / latest), weights(tmp_path / 'c' / latest))
-
-
-def test_resume_goes_on_where_the_run_stopped(tmp_path):
-    run = tmp_path / 'run'
-    assert main([*RUN, '--output', str(run)]) == 0
-    before = weights(run / STATE)
-    assert main(['--resume', str(run), '--steps', '3200']) == 0
-    rows = list(csv.DictReader((run / 'progress.csv').open()))
-    steps = [int(row['env_steps']) for row in rows]
-    assert steps == [400, 800, 1200, 1600, 2000, 2400, 2800, 3200]
-    updates = [int(row['updates']) for row in rows]
-    assert updates == [4, 8, 12, 16, 20, 24, 28, 32]
-    after = weights(run / STATE)
-    count = 'observation_statistics.count'
-    assert before[count] == 1200 and after[count] == 3200
-    assert checkpoint.read_info(run / 'latest.safetensors').env_steps == 3200
 
 
 def test_the_latest_actor_is_the_averaged_one_that_evaluations_measure(tmp_path):
