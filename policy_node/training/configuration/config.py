@@ -424,13 +424,13 @@ def require_within(name: str, value: Any, kind: Any) -> None:
 NEEDS: tuple[tuple[str, str, Callable[[Any], bool]], ...] = (
     (
         'subgoal_every polyak target_update_interval policy_delay target discount critics '
-        'aggregate norm quantiles random_epsilon final_exploration noise_seconds parameter_noise',
+        'aggregate norm quantiles random_epsilon final_exploration noise_seconds',
         'algorithm ddpg',
         lambda c: c.algorithm == 'ddpg',
     ),
     ('noise_std', 'algorithm ddpg or ppo', lambda c: c.algorithm != 'imitation'),
     (
-        'n_step longest_hold advantage condition goal_choice subgoal_prior ticks_after_drop',
+        'n_step longest_hold condition goal_choice ticks_after_drop parameter_noise',
         'algorithm ddpg and no subgoal_every',
         lambda c: c.algorithm == 'ddpg' and not c.subgoal_every,
     ),
@@ -441,6 +441,26 @@ NEEDS: tuple[tuple[str, str, Callable[[Any], bool]], ...] = (
             c.algorithm == ('ppo' if c.importance == 'decision' else 'ddpg') and not c.subgoal_every
         ),
     ),
+    (
+        'advantage',
+        'algorithm ddpg, no subgoal_every, discount time and one critic of its mean without batch '
+        'normalisation',
+        lambda c: (
+            c.algorithm == 'ddpg'
+            and (c.subgoal_every, c.discount, c.critics, c.quantiles) == (0, 'time', 1, 1)
+            and c.aggregate == 'mean'
+            and c.norm != 'batch'
+        ),
+    ),
+    (
+        'subgoal_prior',
+        'algorithm ddpg without subgoal_every, longest_hold, advantage, condition and importance',
+        lambda c: (
+            c.algorithm == 'ddpg'
+            and not (c.subgoal_every or c.advantage or c.longest_hold > 1)
+            and c.condition == c.importance == 'none'
+        ),
+    ),
     ('correction', 'n_step other than 1', lambda c: c.n_step > 1),
     (
         'trace',
@@ -449,11 +469,19 @@ NEEDS: tuple[tuple[str, str, Callable[[Any], bool]], ...] = (
     ),
     ('widest_threshold', 'condition threshold', lambda c: c.condition == 'threshold'),
     ('imagination_interval', 'subgoal_prior other than 0.0', lambda c: c.subgoal_prior > 0.0),
-    ('drop_is_lost', 'ticks_after_drop other than -1', lambda c: c.ticks_after_drop >= 0),
+    (
+        'drop_is_lost',
+        'ticks_after_drop other than -1 and reward_type sparse, without condition horizon and '
+        'goal_choice bellman',
+        lambda c: (
+            (c.ticks_after_drop >= 0 and c.reward_type == 'sparse')
+            and (c.condition != 'horizon' and c.goal_choice != 'bellman')
+        ),
+    ),
     (
         'first_distance first_rotation reward_grades',
-        'reward_type sparse',
-        lambda c: c.reward_type == 'sparse',
+        'reward_type sparse without condition and subgoal_every',
+        lambda c: c.reward_type == 'sparse' and c.condition == 'none' and not c.subgoal_every,
     ),
     ('first_value first_action_gain', 'algorithm ppo', lambda c: c.algorithm == 'ppo'),
     (
@@ -500,7 +528,6 @@ def _rules(config: TrainConfig, spec: TaskSpec) -> Iterator[tuple[bool, str]]:
     goal_features(c.goal_features, spec)
     read_disturbances(c.disturbances)
     ppo, is_sparse = c.algorithm == 'ppo', c.reward_type == 'sparse'
-    is_graded = c.narrows or bool(c.reward_grades)
     yield (
         not 1 <= len(c.hidden_sizes) <= 64 or not all(1 <= n <= MOST_UNITS for n in c.hidden_sizes),
         f'hidden_sizes {str(c.hidden_sizes)[:80]}; allowed: 1 to 64 widths of 1 ... {MOST_UNITS}',
@@ -557,24 +584,6 @@ def _rules(config: TrainConfig, spec: TaskSpec) -> Iterator[tuple[bool, str]]:
         'longest_hold above 1 excludes noise_seconds, parameter_noise and gamble',
     )
     yield (
-        c.advantage
-        and (
-            c.discount != 'time'
-            or c.norm == 'batch'
-            or bool(changed_fields(c, ('critics', 'aggregate', 'quantiles')))
-        ),
-        'advantage needs discount time and one critic of its mean, without norm batch',
-    )
-    yield (
-        c.subgoal_prior > 0.0
-        and bool(changed_fields(c, ('longest_hold', 'advantage', 'condition', 'importance'))),
-        'subgoal_prior excludes longest_hold, advantage, condition and importance',
-    )
-    yield (
-        c.condition != 'none' and is_graded,
-        'condition excludes reward_grades, first_distance and first_rotation',
-    )
-    yield (
         c.condition == 'threshold' and not is_sparse,
         'condition threshold needs reward_type sparse',
     )
@@ -583,18 +592,12 @@ def _rules(config: TrainConfig, spec: TaskSpec) -> Iterator[tuple[bool, str]]:
         f'subgoal_every {c.subgoal_every} is longer than an episode',
     )
     yield (
-        c.subgoal_every > 0 and (not is_sparse or is_graded or c.parameter_noise),
-        'subgoal_every needs reward_type sparse and excludes reward_grades, first_distance, '
-        'first_rotation and parameter_noise',
+        c.subgoal_every > 0 and not is_sparse,
+        'subgoal_every needs reward_type sparse',
     )
     yield (
         c.ticks_after_drop >= 0 and spec.goal is not GoalKind.POSE,
         f'ticks_after_drop: {c.task} has no palm to drop an object from',
-    )
-    yield (
-        c.drop_is_lost
-        and (not is_sparse or c.goal_choice == 'bellman' or c.condition == 'horizon'),
-        'drop_is_lost needs reward_type sparse; it excludes condition horizon and bellman',
     )
     yield from _rules_of_goals(c)
 

@@ -23,11 +23,6 @@ _DECIDE_AT_RATES = (
     'importance subgoal_every goal_choice'
 ).split()
 
-# A user who sets one of these gets no imagined subgoals, which exclude other values.
-_EXCLUDE_IMAGINED = (
-    'subgoal_prior algorithm subgoal_every condition advantage longest_hold'
-).split()
-
 
 def ticks_of_40_ms(control_hz: float) -> float:
     """Ticks in 40 ms: steps are counted in these, so that rates can be compared."""
@@ -59,7 +54,9 @@ def recipe_config(task: str, recipe: str, **overrides: Any) -> TrainConfig:
     values = recipes[recipe](task)
     if recipe == 'best':
         values |= _at_rate(task, values, overrides)
-        values |= _imagined(task, overrides)
+        if 'subgoal_prior' in overrides:
+            # The interval of the recipe belongs to the weight of the recipe.
+            values.pop('imagination_interval', None)
     return from_flat({'task': task, 'recipe': recipe, **values}, **overrides)
 
 
@@ -79,13 +76,6 @@ def _at_rate(task: str, values: Mapping[str, Any], overrides: Mapping[str, Any])
         return counts
     ticks = round(ticks_of_40_ms(control_hz))
     return {**counts, 'discount': 'time', 'noise_seconds': 1 / DEFAULT_CONTROL_HZ, 'n_step': ticks}
-
-
-def _imagined(task: str, overrides: Mapping[str, Any]) -> dict[str, Any]:
-    """Subgoals that `best` imagines where they were measured to pay (docs/research/hierarchy)."""
-    if task != 'FetchPickAndPlace' or any(name in overrides for name in _EXCLUDE_IMAGINED):
-        return {}
-    return {'subgoal_prior': 0.3, 'imagination_interval': 4}
 
 
 def _paper(task: str) -> dict[str, Any]:
@@ -163,6 +153,8 @@ _HAND_REACH = {
 _BEST: dict[str, dict[str, Any]] = {
     'FetchReach': _REACH,
     'FetchPush': _PUSH,
+    # Imagined subgoals where they were measured to pay (docs/research/hierarchy).
+    'FetchPickAndPlace': _FETCH | {'subgoal_prior': 0.3, 'imagination_interval': 4},
     'FetchSlide': _SLIDE,
     'HandReach': _HAND_REACH,
 }
