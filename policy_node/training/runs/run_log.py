@@ -21,7 +21,6 @@ from node_runtime.signals import discard_unread_output
 from policy_node.training.evaluation import EpisodeOutcomes, diagnose, success_rate
 from policy_node.training.learners.actor_critic import Losses
 from policy_node.training.runs.run_folder import BOARD_FOLDER, PROGRESS_FILE
-from policy_node.training.runs.training_state import Counters
 
 COLUMNS = (
     'seconds',
@@ -146,28 +145,17 @@ class RunLog:
         return _clock(max(remaining, 0.0))
 
 
-def progress_row(
-    counters: Counters,
-    train_success: float,
-    outcomes: EpisodeOutcomes | None,
-    success_rule: str,
-) -> Row:
-    """Return the values of a cycle by column; `outcomes` are those of its evaluation, if any."""
-    row: Row = {
-        'seconds': counters.seconds,
-        'env_steps': counters.env_steps,
-        'episodes': counters.episodes,
-        'updates': counters.updates,
-        'train_success': train_success,
-        'processor_seconds': counters.processor_seconds,
+def evaluation_columns(outcomes: EpisodeOutcomes | None, success_rule: str) -> Row:
+    """Return the values of an evaluation by column; none without an evaluation."""
+    if outcomes is None:
+        return {}
+    found = {f'eval_{n}': value for n, value in diagnose(outcomes).items() if n != 'long_way_share'}
+    return {
+        'eval_success': success_rate(outcomes, success_rule),
+        'eval_episodes': len(outcomes),
+        'eval_touched': float(outcomes.touched.mean()),
+        **found,
     }
-    if outcomes is not None:
-        row['eval_success'] = success_rate(outcomes, success_rule)
-        row['eval_episodes'] = len(outcomes)
-        row['eval_touched'] = float(outcomes.touched.mean())
-        found = diagnose(outcomes)
-        row |= {f'eval_{name}': found[name] for name in found if name != 'long_way_share'}
-    return row
 
 
 def loss_columns(losses: Sequence[Losses]) -> Row:

@@ -38,7 +38,7 @@ from policy_node.training.research.registry import (
 )
 from policy_node.training.runs.initial_networks import CRITIC_FIRST, InitialNetworks
 from policy_node.training.runs.run_folder import NAME, RunFolder
-from policy_node.training.runs.run_log import Row, RunLog, loss_columns, progress_row
+from policy_node.training.runs.run_log import Row, RunLog, evaluation_columns, loss_columns
 from policy_node.training.runs.training_state import (
     Counters,
     RunClock,
@@ -111,12 +111,19 @@ class BaseTrainer:
         self, train_success: float, outcomes: EpisodeOutcomes | None, samples: int, seconds: float
     ) -> Row:
         """Return the row of a cycle that took so many seconds and learnt from so many samples."""
-        row = progress_row(self.counters, train_success, outcomes, self.config.success_rule)
-        workers = self.workers
+        counters, workers = self.counters, self.workers
         steps = workers.share(self.config.num_envs) * self.spec.episode_ticks * workers.world_size
-        row['steps_per_second'] = steps / seconds
-        row['samples_per_second'] = samples / seconds
-        return row
+        return {
+            'seconds': counters.seconds,
+            'env_steps': counters.env_steps,
+            'episodes': counters.episodes,
+            'updates': counters.updates,
+            'train_success': train_success,
+            'processor_seconds': counters.processor_seconds,
+            **evaluation_columns(outcomes, self.config.success_rule),
+            'steps_per_second': steps / seconds,
+            'samples_per_second': samples / seconds,
+        }
 
 
 class Trainer(BaseTrainer):

@@ -118,6 +118,11 @@ def test_invalid_tensors_are_rejected(run, change, message, capsys):
     assert message in refusal(run, capsys)
 
 
+def test_an_actor_is_no_training_state(run, capsys):
+    shutil.copy(run / BEST, run / STATE)
+    assert 'fetch_hand_actor' in refusal(run, capsys)
+
+
 def test_no_run_starts_from_networks_that_are_not_finite(run):
     change_state(run, nan_in('critic.network.output.bias'))
     with pytest.raises(ValueError, match=r'critic\.network\.output\.bias'):

@@ -15,6 +15,7 @@ from policy_node.training.experience.replay import Transitions
 from policy_node.training.machine import Workers, choose_device, uses_bfloat16
 from policy_node.training.research.judged import Judge
 from policy_node.training.research.registry import make_ddpg
+from support import learners
 
 # Small products: more threads only wait for each other, and on a busy machine for very long.
 torch.set_num_threads(1)
@@ -24,11 +25,8 @@ CPU = torch.device('cpu')
 
 
 def make_learner(layer_norm=False, **changes):
-    torch.manual_seed(0)
-    options = {'precision': 'float32', 'gamma': 0.9, **changes}
-    config = recipe_config('FetchReach', 'paper', **options)
     shape = NetworkShape(3, 2, 2, (32, 32), layer_norm)
-    return make_ddpg(shape, config, CPU, Workers())
+    return learners.make_learner(shape, **{'gamma': 0.9, 'learning_rate': 1e-3, **changes})
 
 
 def make_batch(count=64, seed=0, reward=None):

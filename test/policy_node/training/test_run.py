@@ -303,23 +303,6 @@ def test_a_closed_terminal_keeps_the_run(tmp_path, start_run):
     assert_is_saved(tmp_path / 'run')
 
 
-def test_a_missing_library_is_reported_before_the_first_step(tmp_path):
-    code = (
-        'import importlib.abc, sys\n'
-        'class Without(importlib.abc.MetaPathFinder):\n'
-        '    def find_spec(self, name, *rest):\n'
-        '        if name == "matplotlib": sys.meta_path[:] = sys.meta_path[:1]\n'
-        'sys.meta_path.insert(0, Without())\n'
-        'from policy_node.training.train_her import main\n'
-        f'sys.exit(main(["--task", "FetchReach", "--output", {str(tmp_path / "run")!r}]))\n'
-    )
-    result = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True)
-    assert result.returncode == 2, result.stderr
-    assert 'fetch_hand_sim train: matplotlib' in result.stderr
-    assert "pip install 'fetch_hand_sim[train]'" in result.stderr
-    assert result.stderr.count('\n') == 1 and not (tmp_path / 'run').exists()
-
-
 @pytest.mark.parametrize('output', ['file', '/proc/run', 'file/run'])
 def test_an_output_that_cannot_be_a_folder_is_one_line(output, tmp_path, capsys):
     (tmp_path / 'file').write_text('')

@@ -20,7 +20,6 @@ from policy_node.training.research.hierarchy import (
     with_subgoals,
 )
 from policy_node.training.research.registry import make_collector
-from policy_node.training.train_her import main
 
 torch.set_num_threads(1)
 
@@ -141,10 +140,3 @@ def test_half_of_the_goals_that_are_kept_are_subgoals():
         'subgoal': 0.1,
     }
     assert with_subgoals({'future': 1.0}) == {'future': 1.0}
-
-
-def test_logged_episodes_have_no_subgoals(tmp_path, capsys):
-    arguments = ['--task', 'FetchReach', '--set', 'subgoal_every=10', '--output', str(tmp_path)]
-    assert main([*arguments, '--from-episodes', str(tmp_path)]) == 2
-    error = capsys.readouterr().err
-    assert 'subgoal_every excludes --from-episodes' in error and error.count('\n') == 1

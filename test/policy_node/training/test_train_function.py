@@ -148,7 +148,6 @@ def test_a_second_interrupt_does_not_wait_for_a_collection():
         ({'resume': 'no'}, "resume 'no'; allowed: True or False"),
         ({'resume': True}, 'is not the folder of a run'),
         ({'resume': True, 'output': None}, 'resume=True needs output'),
-        ({'output': '/proc/nothing'}, '/proc/nothing cannot hold a run'),
         ({'init_from': 'nothing'}, "no actor 'nothing'"),
     ],
 )

@@ -229,16 +229,6 @@ def test_settings_of_training_do_not_change_evaluation(tmp_path):
         np.testing.assert_array_equal(first, second)
 
 
-def test_an_unfitting_state_is_refused_in_one_line(tmp_path):
-    trainer_of(tmp_path).save()
-    wide = trainer_of(tmp_path, hidden_sizes=(32,))
-    with pytest.raises(ValueError, match=STATE) as caught:
-        wide.resume(tmp_path / STATE)
-    assert '\n' not in str(caught.value)
-    with pytest.raises(ValueError, match='fetch_hand_actor'):
-        wide.resume(tmp_path / 'latest.safetensors')
-
-
 def poison_critic(learner):
     learner.critic.network.output.bias.fill_(float('nan'))
 
@@ -380,6 +370,7 @@ def test_two_workers_train_together(tmp_path):
         ('--task FetchReach --replay-transitions 1000 --learning-starts 1001', '1001 or more'),
         (f'{" ".join(PPO)} --task FetchReach --from-episodes .', 'ppo excludes --from-episodes'),
         ('--task FetchReach --gamble --from-episodes .', 'gamble excludes --from-episodes'),
+        ('--task FetchReach --subgoal-every 9 --from-episodes .', 'subgoal_every excludes --from'),
         ('--task FetchReach --strategy past', "strategy 'past'"),
         ('--resume nowhere', 'nowhere is not the folder of a run'),
     ],
