@@ -132,18 +132,15 @@ def _read_experience(config: TrainConfig, directory: Path | None) -> Episodes | 
     """
     if directory is None:
         return None
-    if config.algorithm == 'ppo':
-        raise ValueError(
-            'algorithm ppo excludes --from-episodes: it learns only from its own episodes'
-        )
-    if config.longest_hold > 1:
-        raise ValueError(
-            'longest_hold above 1 excludes --from-episodes: logged actions have no length'
-        )
-    if config.subgoal_every:
-        raise ValueError('subgoal_every excludes --from-episodes: logged episodes have no subgoals')
-    if config.gamble:
-        raise ValueError('gamble excludes --from-episodes: in logged episodes gambles end nothing')
+    excluded = {
+        'algorithm ppo': (config.algorithm == 'ppo', 'it learns only from its own episodes'),
+        'longest_hold above 1': (config.longest_hold > 1, 'logged actions have no length'),
+        'subgoal_every': (config.subgoal_every > 0, 'logged episodes have no subgoals'),
+        'gamble': (config.gamble, 'in logged episodes gambles end nothing'),
+    }
+    for name, (is_set, why) in excluded.items():
+        if is_set:
+            raise ValueError(f'{name} excludes --from-episodes: {why}')
     from policy_node.training.experience.episode_files import read_experience
 
     task = task_spec(config.task, control_hz=config.control_hz)

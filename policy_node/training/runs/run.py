@@ -151,16 +151,13 @@ def train_run(
             if (output / STATE_FILE).is_file():
                 note = f'the last checkpoint is in {output}'
             raise TrainingError(f'{error}; {note}') from None
+        except ValueError as error:
+            # A defect, not a wrong argument: commands show its traceback.
+            raise RuntimeError(f'training failed: {error}') from error
         finally:
             leave_workers(trainer.workers)
         if caller is not None and caller.error is not None:
             raise caller.error
-        if trainer.workers.is_first:
-            title = f'{config.task}, {config.recipe} recipe, seed {config.seed}'
-            try:
-                draw_curve(read_progress(output / PROGRESS_FILE), title, output / CURVE_FILE)
-            except OSError as error:
-                complain(NAME, f'no curve, the run itself is saved: {error}')
         return ending
 
 
@@ -233,6 +230,12 @@ def _train(
     finally:
         if log is not None:
             log.close()
+    if log is not None:
+        title = f'{config.task}, {config.recipe} recipe, seed {config.seed}'
+        try:
+            draw_curve(read_progress(output / PROGRESS_FILE), title, output / CURVE_FILE)
+        except OSError as error:
+            complain(NAME, f'no curve, the run itself is saved: {error}')
     return Ending(reason, trainer.counters, received[0] if received else 0)
 
 
