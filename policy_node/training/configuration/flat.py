@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from msgs_spec.text import did_you_mean
+from policy_node.training.configuration import config
 from policy_node.training.configuration.config import (
     DEFAULTS,
     LARGEST,
@@ -91,11 +92,12 @@ class Field:
 def _describe() -> dict[str, Field]:
     """Return the fields with the text below each, on one line, in the order of the groups."""
     found = {}
-    for group in reversed(TrainConfig.__mro__[1:-1]):
-        (definition,) = ast.parse(inspect.getsource(group)).body
-        assert isinstance(definition, ast.ClassDef)
-        title = (group.__doc__ or '').splitlines()[0].rstrip('.')
-        for field, below in itertools.pairwise(definition.body):
+    groups = {each.__name__ for each in TrainConfig.__mro__[1:-1]}
+    for group in ast.parse(inspect.getsource(config)).body:
+        if not isinstance(group, ast.ClassDef) or group.name not in groups:
+            continue
+        title = (ast.get_docstring(group) or '').splitlines()[0].rstrip('.')
+        for field, below in itertools.pairwise(group.body):
             match field, below:
                 case ast.AnnAssign(ast.Name(name)), ast.Expr(ast.Constant(str(text))):
                     found[name] = Field(name, ' '.join(text.split()), title)
