@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal, cast
 
-from msgs_spec.text import did_you_mean, one_line
+from msgs_spec.text import did_you_mean, entries, one_line
 
 Span = tuple[float, float]
 Kind = Literal['size', 'probability', 'factor', 'ticks', 'period', 'span']
@@ -253,11 +253,10 @@ class Disturbances:
         """Return the disturbances in the result of `as_dict`, or raise ValueError."""
         groups: dict[str, Any] = {each.name: type(each.default) for each in fields(cls)}
         found: dict[str, Any] = {}
-        for name, given in _entries('disturbances', values, list(groups)):
-            kinds = [each.name for each in fields(groups[name])]
-            entries = dict(_entries(name, given, kinds))
+        for name, given in entries('disturbances', values, list(groups)).items():
+            values = entries(name, given, [each.name for each in fields(groups[name])])
             try:
-                found[name] = groups[name](**entries)
+                found[name] = groups[name](**values)
             except ValueError as error:
                 raise ValueError(f'{name}.{error}') from None
         return cls(**found)
@@ -317,20 +316,6 @@ def _scale(text: str) -> float:
     if not 0.0 <= scale <= 10.0:
         raise ValueError(f'scale {text[:20]!r} of disturbances; allowed: 0 ... 10')
     return scale
-
-
-def _entries(owner: str, values: Any, allowed: list[str]) -> list[tuple[str, Any]]:
-    if not isinstance(values, Mapping):
-        raise ValueError(
-            f'{owner}: {one_line(values, 40)!r} given; allowed: a mapping with {", ".join(allowed)}'
-        )
-    for name in values:
-        if name not in allowed:
-            raise ValueError(
-                f'{owner} has no {one_line(name, 40)!r}; allowed: {", ".join(allowed)}'
-                f'{did_you_mean(str(name), allowed)}'
-            )
-    return [(str(name), value) for name, value in values.items()]
 
 
 def _scaled(group: _Group, factor: float) -> Any:

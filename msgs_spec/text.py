@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable, Mapping, Sequence
-from typing import TypeVar
+from typing import Any, TypeVar
 
 Name = TypeVar('Name', bound=str)
 # Maximum number of characters of a received name in an error.
@@ -22,12 +22,24 @@ def did_you_mean(given: str, allowed: Iterable[str] | Mapping[str, str]) -> str:
     return f'; did you mean {by_lower[found[0]]!r}?' if found else ''
 
 
-def one_of(given: str, allowed: Sequence[Name], meaning: str) -> Name:
+def one_of(given: object, allowed: Sequence[Name], meaning: str) -> Name:
     """Return `given`, an untrusted `meaning`, if it is allowed; raise ValueError otherwise."""
     for name in allowed:
         if given == name:
             return name
-    raise ValueError(f'{meaning} {given[:_SHOWN]!r}; allowed: {", ".join(allowed)}')
+    hint = did_you_mean(str(given)[:_SHOWN], allowed)
+    shown = one_line(given, _SHOWN)
+    raise ValueError(f'{meaning} {shown!r}; allowed: {", ".join(map(str, allowed))}{hint}')
+
+
+def entries(owner: str, values: Any, allowed: Sequence[str]) -> dict[str, Any]:
+    """Return an untrusted mapping; raise ValueError for another type or an unknown name."""
+    if not isinstance(values, Mapping):
+        raise ValueError(
+            f'{owner}: {one_line(values, _SHOWN)!r} given; allowed: a mapping of '
+            f'{", ".join(allowed)}'
+        )
+    return {one_of(name, allowed, f'{owner} has no'): value for name, value in values.items()}
 
 
 def first_of(names: Sequence[str], most: int) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import gymnasium
@@ -10,28 +9,17 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fetch_hand_sim.gym_envs.pictures import (
-    RENDER_MODES,
-    Image,
-    Pictures,
-    check_render_mode,
-    render_fps,
-)
+from fetch_hand_sim.gym_envs.pictures import RENDER_MODES, Image
 from fetch_hand_sim.gym_envs.task_attributes import (
     TaskAttributes,
     action_space,
-    check_reset_options,
     clip_actions,
-    given_by_options,
-    goals_of_options,
     observation_space,
 )
 from fetch_hand_sim.simulation import Observation, Simulation
-from fetch_hand_sim.simulation.arguments import finite_goal
-from fetch_hand_sim.simulation.rendering import HEIGHT, WIDTH
+from fetch_hand_sim.simulation.arguments import finite_numbers
 from msgs_spec.arrays import Array
-from msgs_spec.disturbances import Disturbances
-from msgs_spec.tasks import DEFAULT_CONTROL_HZ, RewardType, SuccessRule
+from msgs_spec.tasks import DEFAULT_CONTROL_HZ
 
 
 class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32]]):
@@ -46,21 +34,7 @@ class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32
     `compute_terminated`, `compute_truncated` and `compute_reward` (achieved_goal, desired_goal,
     info). Resets and steps ask them, in the order of the reference.
 
-    Args:
-        task: One of the tasks (`msgs_spec.tasks.TASKS`).
-        reward_type: `sparse` (-1 or 0) or `dense` (minus the distance).
-        success_rule: `gymnasium` (released code) or `paper` (its text).
-        control_hz: Actions per simulated second: 500/n for n = 1 ... 40. With another than 25 use
-            `fetch_hand_sim.make`: Gymnasium would end episodes after the steps of 25 Hz.
-        render_mode: One of `metadata['render_modes']` or None.
-        width: Pixels of a picture.
-        height: Pixels of a picture.
-        default_camera_config: Attributes of `mujoco.MjvCamera`, such as `distance` (m),
-            `azimuth`, `elevation` (degrees) and `lookat` (m); None for the task's view.
-        distance_threshold: Success within this distance, metres; None for the task's own.
-        rotation_threshold: Success within this rotation, radians; None for the task's own.
-        disturbances: Delays, noise, other physics: a preset (`hardware`, `hardware*0.5`), a
-            mapping, a JSON or YAML file or `Disturbances`; None for an undisturbed robot.
+    Arguments are those of `TaskAttributes`.
 
     Raises:
         ValueError: If an argument is not allowed.
@@ -71,40 +45,11 @@ class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32
         'render_fps': int(DEFAULT_CONTROL_HZ),
     }
 
-    def __init__(
-        self,
-        task: str,
-        reward_type: RewardType = 'sparse',
-        success_rule: SuccessRule = 'gymnasium',
-        control_hz: float = DEFAULT_CONTROL_HZ,
-        render_mode: str | None = None,
-        width: int = WIDTH,
-        height: int = HEIGHT,
-        default_camera_config: Mapping[str, Any] | None = None,
-        distance_threshold: float | None = None,
-        rotation_threshold: float | None = None,
-        disturbances: Disturbances | Mapping[str, Any] | str | None = None,
-    ) -> None:
-        check_render_mode(render_mode)
-        self.simulation = Simulation(
-            task,
-            num_envs=1,
-            num_threads=1,
-            reward_type=reward_type,
-            success_rule=success_rule,
-            control_hz=control_hz,
-            keeps_data=True,
-            disturbances=disturbances,
-        )
-        self.spec_of_task = self.simulation.spec
-        self.metadata = {**self.metadata, 'render_fps': render_fps(control_hz)}
+    def __init__(self, task: str, *args: Any, **arguments: Any) -> None:
+        super().__init__(task, *args, num_threads=1, keeps_data=True, **arguments)
         self.observation_space = observation_space(self.spec_of_task)
         self.action_space = action_space(self.spec_of_task)
-        self.render_mode = render_mode
-        self.width, self.height = width, height
-        self._pictures = Pictures(self.simulation, width, height, default_camera_config)
         self._physics = SharedPhysics(self.simulation)
-        self.set_thresholds(distance_threshold, rotation_threshold)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -125,16 +70,13 @@ class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32
             The observation, and an empty dictionary.
 
         Raises:
-            TypeError: If options is not a dictionary.
             ValueError: If an option is unknown or the goal is invalid.
             gymnasium.error.Error: If the seed is no integer or negative.
         """
-        check_reset_options(options, allowed=('goal', 'variation', 'start'))
-        asked = goals_of_options(options, np.ones(1, dtype=bool), self.spec_of_task)
-        given = given_by_options(options, np.ones(1, dtype=bool))
+        asked, given = self._read_options(options, np.ones(1, dtype=bool))
         super().reset(seed=seed)
         self._physics.send()
-        self._release_goal()
+        self.simulation.goals = self.simulation.goals.copy()
         draws_goals = self._draws_goals()
         observation = _first(self.simulation.reset(seed=[self.np_random], **given))
         self._physics.receive()
@@ -220,9 +162,10 @@ class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32
 
     @goal.setter
     def goal(self, goal: ArrayLike) -> None:
-        given = finite_goal(goal, self.simulation.spec)
-        self._release_goal()
-        self.simulation.goals[0] = given
+        size = (self.spec_of_task.goal.size,)
+        given = finite_numbers(f'goal of {self.spec_of_task.name}', goal, size)
+        # References to the old array keep their values.
+        self.simulation.goals = given[None].copy()
 
     def render(self) -> Image | None:
         """Returns a picture of the robot and its goal.
@@ -265,10 +208,6 @@ class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32
     def _sample_goal(self) -> Array:
         self._physics.send()
         return self.simulation.task.sample_goal(0, self.np_random)
-
-    def _release_goal(self) -> None:
-        """Replace the goals by a copy, so that references to the old array keep their values."""
-        self.simulation.goals = self.simulation.goals.copy()
 
     def _show(self) -> None:
         if self.render_mode == 'human':

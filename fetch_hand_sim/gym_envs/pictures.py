@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import mujoco
@@ -10,13 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fetch_hand_sim.simulation import Simulation
-from fetch_hand_sim.simulation.arguments import require_whole
 from fetch_hand_sim.simulation.opengl import start_glfw
 from fetch_hand_sim.simulation.rendering import (
     HEIGHT,
-    LARGEST_SIDE,
     WIDTH,
     SceneRenderer,
+    check_size,
     make_camera,
     make_options,
     set_attributes,
@@ -28,11 +27,6 @@ Image = NDArray[np.uint8] | NDArray[np.float32]
 
 # `rgb_array_list` and other lists are made of these by `gymnasium.make`.
 RENDER_MODES = ['human', 'rgb_array', 'depth_array']
-
-
-def render_fps(control_hz: float) -> int | float:
-    """Pictures per second of a film that shows every step; whole numbers as `int`."""
-    return int(control_hz) if control_hz == int(control_hz) else control_hz
 
 
 class Pictures:
@@ -49,20 +43,8 @@ class Pictures:
         height: int = HEIGHT,
         camera: Mapping[str, Any] | None = None,
     ) -> None:
-        for name, side in (('width', width), ('height', height)):
-            require_whole(name, side)
-            if not 1 <= side <= LARGEST_SIDE:
-                raise ValueError(f'{name} must be 1 ... {LARGEST_SIDE} pixels, not {side}')
-        if not isinstance(camera, Mapping | None):
-            raise ValueError(f'default_camera_config {camera!r:.60}; allowed: a mapping or None')
-        known = [name for name in dir(mujoco.MjvCamera) if not name.startswith('_')]
-        for name in camera or {}:
-            if name not in known:
-                allowed = ', '.join(known)
-                raise ValueError(
-                    f'default_camera_config: {name!r:.60} is not known; allowed: {allowed}'
-                )
-        set_attributes(mujoco.MjvCamera(), camera or {}, simulation.model)
+        check_size(width, height)
+        set_attributes(mujoco.MjvCamera(), {} if camera is None else camera, simulation.model)
         self._simulation = simulation
         self._size = (width, height)
         self._camera = dict(camera or {})
@@ -134,10 +116,3 @@ def _open_window(scene: Scene, width: int, height: int) -> Any:
             "render_mode 'human' needs a display; without one use render_mode='rgb_array'"
         )
     return WindowViewer(scene.model, scene.data, width, height)
-
-
-def check_render_mode(mode: str | None, known: Sequence[str] = RENDER_MODES) -> None:
-    """Raise ValueError for an unknown render mode."""
-    if mode not in (None, *known):
-        allowed = ', '.join(('None', *known))
-        raise ValueError(f'render_mode {mode!r:.60} is not known; allowed: {allowed}')

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
-from fetch_hand_sim.gym_envs.task_attributes import check_reset_options, goals_of_options
+from fetch_hand_sim.gym_envs.task_attributes import RESET_OPTIONS
 from fetch_hand_sim.gym_envs.vector_env import FetchHandVectorEnv
 from fetch_hand_sim.simulation import Observation
-from msgs_spec.arrays import Array
+from msgs_spec.text import entries
 
 
 class FetchHandVecEnv(VecEnv):
@@ -49,7 +49,8 @@ class FetchHandVecEnv(VecEnv):
         """
         options = self._options
         self._reset_options()
-        goals = self._asked_goals(options)
+        for each in options:
+            entries('options', each, RESET_OPTIONS)
         given = {
             name: [each.get(name) for each in options]
             for name in ('variation', 'start')
@@ -58,21 +59,10 @@ class FetchHandVecEnv(VecEnv):
         seeds = None if all(seed is None for seed in self._seeds) else self._seeds
         observation, _ = self.batch.reset(seed=seeds, options=given)
         self._reset_seeds()
-        if goals:
-            self.batch.simulation.set_goal(np.array(list(goals.values())), list(goals))
-            observation |= self.batch.simulation.observe()
-        return observation
-
-    def _asked_goals(self, given: Sequence[dict[str, Any]]) -> dict[int, Array]:
-        """Return the goals (goal size,) that options set, by environment."""
-        one = np.ones(1, dtype=bool)
-        goals = {}
-        for index, options in enumerate(given):
-            check_reset_options(options, allowed=('goal', 'variation', 'start'))
-            goal = goals_of_options(options, one, self.batch.spec_of_task)
-            if goal is not None:
-                goals[index] = goal[0]
-        return goals
+        for index, each in enumerate(options):
+            if 'goal' in each:
+                self.batch.simulation.set_goal([each['goal']], [index])
+        return observation | self.batch.simulation.observe()
 
     def step_async(self, actions: NDArray[np.float32]) -> None:
         """Takes the actions (N, action size) of the next step."""

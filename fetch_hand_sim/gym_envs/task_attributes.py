@@ -1,4 +1,4 @@
-"""Rewards and thresholds of a task, for one environment and for a batch."""
+"""The parts that one environment and a batch have in common: arguments, spaces, settings."""
 
 from __future__ import annotations
 
@@ -14,22 +14,83 @@ from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 from numpy.typing import ArrayLike, NDArray
 
+from fetch_hand_sim.gym_envs.pictures import Pictures
 from fetch_hand_sim.simulation import Simulation
-from fetch_hand_sim.simulation.arguments import finite_goals, nearest_quaternions, numbers
+from fetch_hand_sim.simulation.arguments import finite_numbers, nearest_quaternions
+from fetch_hand_sim.simulation.rendering import HEIGHT, WIDTH
 from msgs_spec.arrays import Array
-from msgs_spec.tasks import GoalKind, RewardType, TaskSpec
-from msgs_spec.text import one_line
+from msgs_spec.disturbances import Disturbances
+from msgs_spec.tasks import DEFAULT_CONTROL_HZ, GoalKind, RewardType, SuccessRule, TaskSpec
+from msgs_spec.text import entries, one_line, one_of
 
 # Metres or radians.
 _LARGEST_THRESHOLD = 1e6
+RESET_OPTIONS = ('goal', 'variation', 'start')
 
 
 class TaskAttributes:
-    """Rewards for any goals, and settings that may be changed between steps."""
+    """Rewards for any goals, and settings that may be changed between steps.
 
-    spec_of_task: TaskSpec
-    simulation: Simulation
+    Args:
+        task: One of the tasks (`msgs_spec.tasks.TASKS`).
+        reward_type: `sparse` (-1 or 0) or `dense` (minus the distance).
+        success_rule: `gymnasium` (released code) or `paper` (its text).
+        control_hz: Actions per simulated second: 500/n for n = 1 ... 40. With another than 25 use
+            `fetch_hand_sim.make`: Gymnasium would end episodes after the steps of 25 Hz.
+        render_mode: One of `metadata['render_modes']` or None.
+        width: Pixels of a picture.
+        height: Pixels of a picture.
+        default_camera_config: Attributes of `mujoco.MjvCamera`, such as `distance` (m),
+            `azimuth`, `elevation` (degrees) and `lookat` (m); None for the task's view.
+        distance_threshold: Success within this distance, metres; None for the task's own.
+        rotation_threshold: Success within this rotation, radians; None for the task's own.
+        disturbances: Delays, noise, other physics: a preset (`hardware`, `hardware*0.5`), a
+            mapping, a JSON or YAML file or `Disturbances`; None for an undisturbed robot.
+        **batch: Size of the batch, see `Simulation`.
+
+    Raises:
+        ValueError: If an argument is not allowed.
+    """
+
+    metadata: dict[str, Any]
     _spec: EnvSpec | None = None
+
+    def __init__(
+        self,
+        task: str,
+        reward_type: RewardType = 'sparse',
+        success_rule: SuccessRule = 'gymnasium',
+        control_hz: float = DEFAULT_CONTROL_HZ,
+        render_mode: str | None = None,
+        width: int = WIDTH,
+        height: int = HEIGHT,
+        default_camera_config: Mapping[str, Any] | None = None,
+        distance_threshold: float | None = None,
+        rotation_threshold: float | None = None,
+        disturbances: Disturbances | Mapping[str, Any] | str | None = None,
+        **batch: Any,
+    ) -> None:
+        if render_mode is not None:
+            one_of(render_mode, self.metadata['render_modes'], 'render_mode')
+        self.simulation = Simulation(
+            task,
+            reward_type=reward_type,
+            success_rule=success_rule,
+            control_hz=control_hz,
+            disturbances=disturbances,
+            **batch,
+        )
+        self.spec_of_task = self.simulation.spec
+        # Pictures per second of a film that shows every step.
+        fps = int(control_hz) if control_hz == int(control_hz) else control_hz
+        self.metadata = {**self.metadata, 'render_fps': fps}
+        self.render_mode = render_mode
+        self.width, self.height = width, height
+        self._pictures = Pictures(self.simulation, width, height, default_camera_config)
+        if distance_threshold is not None:
+            self.distance_threshold = distance_threshold
+        if rotation_threshold is not None:
+            self.rotation_threshold = rotation_threshold
 
     def __copy__(self) -> Self:
         """As `copy.deepcopy`: two environments have no physics or generators in common."""
@@ -42,8 +103,13 @@ class TaskAttributes:
 
     @spec.setter
     def spec(self, spec: EnvSpec | None) -> None:
-        if spec is not None:
-            _check_task(spec)
+        if spec is not None and (registered := gymnasium.registry.get(spec.id)) is not None:
+            task = spec.kwargs.get('task')
+            if registered.kwargs.get('task', task) != task:
+                raise ValueError(
+                    f'{spec.id} is {registered.kwargs["task"]}, not {task}, which has an id of its '
+                    'own'
+                )
         self._spec = spec
 
     def compute_reward(
@@ -117,13 +183,6 @@ class TaskAttributes:
             raise ValueError(f'{self.spec_of_task.name} has no rotation_threshold')
         self._set_threshold('rotation_threshold', threshold)
 
-    def set_thresholds(self, distance: float | None, rotation: float | None) -> None:
-        """Set the thresholds that are not None, m and rad, or raise ValueError."""
-        if distance is not None:
-            self.distance_threshold = distance
-        if rotation is not None:
-            self.rotation_threshold = rotation
-
     def _set_threshold(self, name: str, value: float) -> None:
         if not (isinstance(value, Real) and 0.0 <= value < _LARGEST_THRESHOLD):
             raise ValueError(
@@ -133,74 +192,47 @@ class TaskAttributes:
         changed: dict[str, Any] = {name: float(value)}
         self.simulation.metric = metric.with_changes(spec=replace(metric.spec, **changed))
 
+    def _read_options(
+        self, options: Any, mask: NDArray[np.bool_], *others: str
+    ) -> tuple[Array | None, dict[str, Any]]:
+        """Return what options of `reset` ask for, checked before anything has moved.
 
-def _check_task(spec: EnvSpec) -> None:
-    """Raise ValueError if the argument `task` is not the task of the id."""
-    registered = gymnasium.registry.get(spec.id)
-    task = spec.kwargs.get('task')
-    if registered is not None and registered.kwargs.get('task', task) != task:
-        raise ValueError(
-            f'{spec.id} is {registered.kwargs["task"]}, not {task}, which has an id of its own'
-        )
+        Args:
+            options: A dictionary or None. `goal`: (goal size,) for all or (N, goal size).
+                `variation` and `start`: one for all, or a list of N.
+            mask: (N,) which environments start.
+            others: Names of further options.
 
-
-def check_reset_options(options: Any, allowed: tuple[str, ...]) -> None:
-    """Raise TypeError or ValueError for invalid options of `reset`."""
-    if options is None:
-        return
-    if not isinstance(options, dict):
-        raise TypeError(f'options of reset are a dictionary or None, not {options!r}')
-    for name in options:
-        if name not in allowed:
-            known = ', '.join(allowed) or 'none'
-            raise ValueError(f'reset option {name!r} is not known; allowed: {known}')
-
-
-def given_by_options(options: Any, mask: NDArray[np.bool_]) -> dict[str, Any]:
-    """Return `variation` and `start` in options of `reset`, for `Simulation.reset`.
-
-    Each is one for all or a list of N; `mask` (N,) marks the environments that start.
-    """
-    given = {}
-    for name in ('variation', 'start'):
-        value = (options or {}).get(name)
-        if isinstance(value, list | tuple):
-            if len(value) != mask.size:
-                raise ValueError(f'{name}: {len(value)} values; allowed: one, or {mask.size}')
-            value = [each for each, starts in zip(value, mask, strict=True) if starts]
-        given[name] = value
-    return given
-
-
-def goals_of_options(options: Any, mask: NDArray[np.bool_], spec: TaskSpec) -> Array | None:
-    """The goals that options of `reset` ask for; checked before anything has moved.
-
-    Args:
-        options: A dictionary with `goal`, (goal size,) for all or (N, goal size), or without.
-        mask: (N,) which environments start.
-
-    Returns:
-        (n, goal size), of the n that start, unit quaternions; None where goals are drawn.
-    """
-    if not options or 'goal' not in options:
-        return None
-    one = (spec.goal.size,)
-    shape = (mask.size, *one)
-    given = numbers(options['goal'], f'a goal of {spec.name}', f'{one} or {shape}')
-    if given.shape not in (one, shape):
-        raise ValueError(f'a goal of {spec.name} has shape {one} or {shape}, not {given.shape}')
-    goals = finite_goals(np.broadcast_to(given, shape)[mask], int(mask.sum()), spec)
-    return nearest_quaternions(goals, goals) if spec.goal is GoalKind.POSE else goals
+        Returns:
+            Goals (n, goal size) of the n that start, or None where they are drawn; `variation` and
+            `start` for `Simulation.reset`.
+        """
+        given = entries('options', {} if options is None else options, (*RESET_OPTIONS, *others))
+        spec, goals = self.spec_of_task, None
+        if 'goal' in given:
+            one = (spec.goal.size,)
+            shape = (mask.size, *one)
+            goal = finite_numbers(f'goal of {spec.name}', given['goal'], one, shape)
+            goals = np.array(np.broadcast_to(goal, shape)[mask], dtype=np.float64)
+            if spec.goal is GoalKind.POSE:
+                goals = nearest_quaternions(goals, goals)
+        found = {}
+        for name in ('variation', 'start'):
+            value = given.get(name)
+            if isinstance(value, list | tuple):
+                if len(value) != mask.size:
+                    raise ValueError(f'{name}: {len(value)} values; allowed: one, or {mask.size}')
+                value = [each for each, starts in zip(value, mask, strict=True) if starts]
+            found[name] = value
+        return goals, found
 
 
 def observation_space(spec: TaskSpec) -> spaces.Space[Any]:
     """`observation`, `achieved_goal` and `desired_goal`, float64, unbounded, SI units."""
+    sizes = {'observation': spec.observation_size}
+    sizes |= dict.fromkeys(('achieved_goal', 'desired_goal'), spec.goal.size)
     return spaces.Dict(
-        {
-            'observation': _unbounded(spec.observation_size),
-            'achieved_goal': _unbounded(spec.goal.size),
-            'desired_goal': _unbounded(spec.goal.size),
-        }
+        {name: spaces.Box(-np.inf, np.inf, (size,), np.float64) for name, size in sizes.items()}
     )
 
 
@@ -215,7 +247,3 @@ def clip_actions(actions: NDArray[Any]) -> NDArray[Any]:
     The type stays too: the Fetch tasks scale actions in it.
     """
     return np.clip(actions, -1.0, 1.0) if actions.dtype.kind in 'fiu' else actions
-
-
-def _unbounded(size: int) -> spaces.Box:
-    return spaces.Box(-np.inf, np.inf, shape=(size,), dtype=np.float64)

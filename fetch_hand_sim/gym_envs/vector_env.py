@@ -13,22 +13,18 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from fetch_hand_sim.episodes.runner import has_ended
-from fetch_hand_sim.gym_envs.pictures import RENDER_MODES, Pictures, check_render_mode, render_fps
+from fetch_hand_sim.gym_envs.pictures import RENDER_MODES
 from fetch_hand_sim.gym_envs.task_attributes import (
     TaskAttributes,
     action_space,
-    check_reset_options,
     clip_actions,
-    given_by_options,
-    goals_of_options,
     observation_space,
 )
-from fetch_hand_sim.simulation import Observation, Simulation, StepResult
-from fetch_hand_sim.simulation.arguments import finite_goal, require_whole
-from fetch_hand_sim.simulation.rendering import HEIGHT, WIDTH
+from fetch_hand_sim.simulation import Observation, StepResult
+from fetch_hand_sim.simulation.arguments import finite_numbers, require_whole
 from msgs_spec.arrays import Array, Flags
-from msgs_spec.disturbances import Disturbances
-from msgs_spec.tasks import DEFAULT_CONTROL_HZ, RewardType, SuccessRule
+from msgs_spec.tasks import DEFAULT_CONTROL_HZ
+from msgs_spec.text import one_of
 
 # Gymnasium's value for episodes without a limit of steps.
 _NO_LIMIT = -1
@@ -48,7 +44,7 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
     Subclasses may bring `compute_reward`, `compute_terminated` and `compute_truncated` of
     (achieved_goal, desired_goal, info) for all N at once: goals (N, goal size), results (N,). The
     other methods that count in `FetchHandEnv` are refused. Arguments that are not listed here are
-    those of `FetchHandEnv`; for another rate than 25 Hz use `fetch_hand_sim.make_vec`.
+    those of `TaskAttributes`; for another rate than 25 Hz use `fetch_hand_sim.make_vec`.
 
     Args:
         task: One of the tasks (`msgs_spec.tasks.TASKS`).
@@ -56,7 +52,6 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
         max_episode_steps: Steps per episode; None for the task's own number, -1 for no limit.
         num_threads: Threads that step them; 0 for all processors that the process may use.
         autoreset_mode: When an ended episode is followed by the next.
-        render_mode: `rgb_array`, `depth_array` or None.
         disable_env_checker: Ignored; `gymnasium.make_vec` passes it to batches too.
 
     Raises:
@@ -76,48 +71,21 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
         num_envs: int = 1,
         max_episode_steps: int | None = None,
         num_threads: int = 0,
-        reward_type: RewardType = 'sparse',
-        success_rule: SuccessRule = 'gymnasium',
-        control_hz: float = DEFAULT_CONTROL_HZ,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
-        render_mode: str | None = None,
-        width: int = WIDTH,
-        height: int = HEIGHT,
-        default_camera_config: Mapping[str, Any] | None = None,
-        distance_threshold: float | None = None,
-        rotation_threshold: float | None = None,
         disable_env_checker: bool | None = None,
-        disturbances: Disturbances | Mapping[str, Any] | str | None = None,
+        **arguments: Any,
     ) -> None:
-        if max_episode_steps is not None:
-            require_whole('max_episode_steps', max_episode_steps)
-            if max_episode_steps < 1 and max_episode_steps != _NO_LIMIT:
-                raise ValueError(
-                    'max_episode_steps must be at least 1, or -1 for no limit, not '
-                    f'{max_episode_steps}'
-                )
-        check_render_mode(render_mode, _RENDER_MODES)
+        if max_episode_steps not in (None, _NO_LIMIT):
+            require_whole('max_episode_steps (-1 for no limit)', max_episode_steps, lowest=1)
         for name in _OF_SINGLE:
             if hasattr(self, name):
                 raise TypeError(_refusal(name))
-        self.autoreset_mode = _autoreset_mode(autoreset_mode)
-        self.simulation = Simulation(
-            task,
-            num_envs=num_envs,
-            num_threads=num_threads,
-            reward_type=reward_type,
-            success_rule=success_rule,
-            control_hz=control_hz,
-            disturbances=disturbances,
-        )
-        self.spec_of_task = self.simulation.spec
+        modes = [mode.value for mode in AutoresetMode]
+        asked = getattr(autoreset_mode, 'value', autoreset_mode)
+        self.autoreset_mode = AutoresetMode(one_of(asked, modes, 'autoreset_mode'))
+        super().__init__(task, num_envs=num_envs, num_threads=num_threads, **arguments)
+        self.metadata['autoreset_mode'] = self.autoreset_mode
         self.num_envs = num_envs
-        self.render_mode = render_mode
-        self.metadata = {
-            **self.metadata,
-            'autoreset_mode': self.autoreset_mode,
-            'render_fps': render_fps(control_hz),
-        }
         self.single_observation_space = observation_space(self.spec_of_task)
         self.single_action_space = action_space(self.spec_of_task)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
@@ -128,9 +96,6 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
         self._elapsed = np.zeros(num_envs, dtype=np.int64)
         self._ended = np.zeros(num_envs, dtype=bool)
         self._seeds: list[int | None] = [None] * num_envs
-        self.width, self.height = width, height
-        self._pictures = Pictures(self.simulation, width, height, default_camera_config)
-        self.set_thresholds(distance_threshold, rotation_threshold)
 
     def __setattr__(self, name: str, value: Any) -> None:
         """Reject a method that only single environments call."""
@@ -159,8 +124,7 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
             dictionary.
 
         Raises:
-            TypeError: If options is not a dictionary, the mask is no boolean array or a seed is no
-                integer.
+            TypeError: If the mask is no boolean array.
             ValueError: If an option is unknown, mask or goal has another shape, a goal or a
                 seed is invalid or the number of seeds is wrong.
             gymnasium.error.ResetNeeded: If the mask leaves out one that was never reset.
@@ -171,8 +135,7 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
             raise gymnasium.error.ResetNeeded(
                 f'the first reset is one of all; reset_mask leaves out {waiting.tolist()!s:.60}'
             )
-        goals = goals_of_options(options, mask, self.spec_of_task)
-        given = given_by_options(options, mask)
+        goals, given = self._read_options(options, mask, 'reset_mask')
         ids = np.flatnonzero(mask)
         seeds = self._each_seed(seed)
         observation = self.simulation.reset(seed=[seeds[i] for i in ids.tolist()], ids=ids, **given)
@@ -355,7 +318,10 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
         if len(each) != self.num_envs:
             raise ValueError(f'{self.num_envs} environments take as many values, not {len(each)}')
         if name == 'goal':
-            self.simulation.goals[:] = [finite_goal(goal, self.simulation.spec) for goal in each]
+            shape = (self.num_envs, self.spec_of_task.goal.size)
+            self.simulation.goals[:] = finite_numbers(
+                f'goals of {self.spec_of_task.name}', each, shape
+            )
         elif name not in _SETTABLE:
             allowed = ', '.join(('goal', *_SETTABLE))
             raise AttributeError(f'{name!r} of a batch cannot be set; allowed: {allowed}')
@@ -370,13 +336,13 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
 
     def _each_seed(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
         """Return the seed of each environment; None continues its random generator."""
-        if isinstance(seed, bool) or not isinstance(
-            seed, int | np.integer | Sequence | np.ndarray | None
-        ):
-            raise TypeError(f'a seed is an integer, a sequence of integers or None, not {seed!r}')
-        if isinstance(seed, int | np.integer):
-            return [int(seed) + i for i in range(self.num_envs)]
-        each = [None] * self.num_envs if seed is None else list(seed)
+        if seed is None:
+            each: list[int | None] = [None] * self.num_envs
+        elif np.ndim(seed):  # type: ignore[arg-type]
+            each = list(seed)  # type: ignore[arg-type]
+        else:
+            require_whole('seed', seed, highest=None)
+            each = [int(seed) + i for i in range(self.num_envs)]  # type: ignore[arg-type]
         if len(each) != self.num_envs:
             raise ValueError(f'{self.num_envs} environments take as many seeds, not {len(each)}')
         # An environment without a seed draws one, which `np_random_seed` returns.
@@ -386,8 +352,7 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
         ]
 
     def _reset_mask(self, options: Any) -> Flags:
-        check_reset_options(options, allowed=('reset_mask', 'goal', 'variation', 'start'))
-        if not options or 'reset_mask' not in options:
+        if not isinstance(options, dict) or 'reset_mask' not in options:
             return np.ones(self.num_envs, dtype=bool)
         mask = options['reset_mask']
         if not isinstance(mask, np.ndarray) or mask.dtype != bool:
@@ -436,11 +401,3 @@ def _masked(values: Mapping[str, Any], mask: Flags) -> dict[str, Any]:
 def _only(values: Mapping[str, NDArray[Any]], mask: Flags) -> dict[str, NDArray[Any]]:
     """Values (N,) of those for whom they count; zero for the others, as Gymnasium has it."""
     return {name: np.where(mask, rows, np.zeros_like(rows)) for name, rows in values.items()}
-
-
-def _autoreset_mode(mode: AutoresetMode | str) -> AutoresetMode:
-    try:
-        return AutoresetMode(mode)
-    except ValueError:
-        allowed = ', '.join(known.value for known in AutoresetMode)
-        raise ValueError(f'autoreset_mode {mode!r} is not known; allowed: {allowed}') from None

@@ -10,35 +10,31 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from fetch_hand_sim.simulation.models import find
 from fetch_hand_sim.simulation.tasks import Task
-from fetch_hand_sim.simulation.tasks.task import chain_dofs, free_joint
+from fetch_hand_sim.simulation.tasks.task import SiteMotion
 from msgs_spec.arrays import Array
 from msgs_spec.disturbances import MOST_TICKS, Disturbances, PhysicsDisturbance
 from msgs_spec.observations import Readings
 from msgs_spec.robots import FINGERTIPS, command_limits
 from msgs_spec.rotations import quaternion_multiply
+from msgs_spec.text import entries
 
 Ids = NDArray[np.intp]
 # Ticks whose random numbers are drawn at once.
 _BLOCK = 64
 # Tracking that is lost comes back after half a second.
 _LOST_TICKS = 12
+_PHYSICS = [each.name for each in fields(PhysicsDisturbance)]
 # Group and field of each range from which an episode draws once.
 _SPANS = {
     'action_latency': ('action', 'latency'),
     'joint_latency': ('joints', 'latency'),
     'object_latency': ('object', 'latency'),
     'object_period': ('object', 'period'),
-    'friction': ('physics', 'friction'),
-    'object_mass': ('physics', 'object_mass'),
-    'object_size': ('physics', 'object_size'),
-    'gain': ('physics', 'gain'),
-    'force_limit': ('physics', 'force_limit'),
-    'damping': ('physics', 'damping'),
-    'table_height': ('physics', 'table_height'),
+    **{name: ('physics', name) for name in _PHYSICS if name != 'gravity_tilt'},
 }
 VARIATIONS = (*_SPANS, 'gravity_tilt', 'gravity_direction')
-_PHYSICS = [each.name for each in fields(PhysicsDisturbance)]
 # Topics computed from the joint sensors, and the sites whose poses they hold.
 _LED = {
     'end_effector_pose': ('robot0:grip',),
@@ -93,25 +89,25 @@ class Disturber:
         self._is_true_current = False
         self._held: dict[str, Array] = {}
         self._physics = VariedPhysics(task, disturbances.physics)
-        self._pushed_body = _pushed_body(task)
+        names = (task.spec.object_name, 'robot0:gripper_link', 'robot0:palm')
+        # The object, or the gripper or palm in tasks without one.
+        self._pushed_body = first_body(task.model, names) or int(task.model.nbody - 1)
         gravity = float(np.linalg.norm(task.model.opt.gravity))
         self._weight = gravity * float(task.model.body_subtreemass[self._pushed_body])
-        joint = free_joint(task.model)
-        # Index of the object's pose in qpos.
-        self._object = None if joint is None else int(task.model.jnt_qposadr[joint])
-        model, names = task.model, task.spec.robot.joints
-        self._joint_qpos = np.array([int(model.joint(names[i]).qposadr[0]) for i in self._angles])
-        self._levers = _levers(task) if self._moves_joint_readings() else {}
-
-    def _moves_joint_readings(self) -> bool:
         joints = self.disturbances.joints
-        return bool(joints.noise or joints.bias or joints.resolution)
+        self._moves_joint_readings = bool(joints.noise or joints.bias or joints.resolution)
+        self._levers: dict[str, list[_Lever]] = {
+            name: [_Lever(task, site) for site in sites]
+            for name, sites in _LED.items()
+            if name in task.sensors and self._moves_joint_readings
+        }
 
     # Episodes
 
     def allow(self, given: Mapping[str, Any]) -> dict[str, float]:
         """Make requested variations possible and return them as numbers, or raise ValueError."""
-        wanted = {name: _variation(name, value) for name, value in given.items()}
+        named = entries('variation', given, VARIATIONS)
+        wanted = {name: _variation(name, value) for name, value in named.items()}
         for name in wanted:
             if name in _PHYSICS:
                 self._physics.allow(name)
@@ -130,12 +126,12 @@ class Disturber:
         self,
         ids: Ids,
         streams: Sequence[np.random.Generator],
-        given: Mapping[int, Mapping[str, float]] | None = None,
+        given: Mapping[int, Mapping[str, float]],
     ) -> None:
         """Begin episodes whose start state the task has set."""
         for index, stream in zip(ids.tolist(), streams, strict=True):
             self._streams[index] = stream
-            self._draw_episode(index, stream, (given or {}).get(index, {}))
+            self._draw_episode(index, stream, given.get(index, {}))
             self._draw_block(index)
         self._tick[ids] = 0
         self._lost[ids] = 0
@@ -192,15 +188,17 @@ class Disturber:
         """Move objects and joints of new episodes; return whether something has moved."""
         start, moved = self.disturbances.start, False
         qpos: Array = self._task.batch.bind('qpos')
-        if self._object is not None:
+        if self._task.object_qpos is not None:
+            place = self._task.object_qpos.start
             lift = self.variations['table_height'][ids]
             if start.object_position or lift.any():
                 shift = start.object_position * self._start_shift[ids]
-                qpos[ids, self._object : self._object + 2] += shift
-                qpos[ids, self._object + 2] += lift
+                qpos[ids, place : place + 2] += shift
+                qpos[ids, place + 2] += lift
                 moved = True
         if start.joints and not self._task.spec.robot.has_gripper_command:
-            qpos[np.ix_(ids, self._joint_qpos)] += start.joints * self._start_joints[ids]
+            places = self._task.joint_qpos[self._angles]
+            qpos[np.ix_(ids, places)] += start.joints * self._start_joints[ids]
             moved = True
         return moved
 
@@ -208,7 +206,9 @@ class Disturber:
 
     def command(self, commands: NDArray[np.floating]) -> NDArray[np.floating]:
         """Return what reaches the motors in this tick, (N, action size), in the type given."""
-        self._next_tick()
+        self._tick += 1
+        for index in np.flatnonzero(self._tick % _BLOCK == 0).tolist():
+            self._draw_block(index)
         action, row = self.disturbances.action, self._tick % _BLOCK
         self._sent = np.roll(self._sent, 1, axis=0)
         self._sent[0] = commands
@@ -241,11 +241,6 @@ class Disturber:
         force = pushes.force * self._weight * self._normal[self._all, row, self._columns['push']]
         forces[pushed, self._pushed_body, :3] += force[pushed]
         return bool(pushed.any())
-
-    def _next_tick(self) -> None:
-        self._tick += 1
-        for index in np.flatnonzero(self._tick % _BLOCK == 0).tolist():
-            self._draw_block(index)
 
     # Sensors
 
@@ -297,7 +292,7 @@ class Disturber:
         if joints.velocity_noise:
             noise = self._normal[self._all, row, self._columns['velocity']]
             states[:, count + self._angles] += joints.velocity_noise * noise
-        if self._moves_joint_readings():
+        if self._moves_joint_readings:
             error = joints.noise * self._normal[self._all, row, self._columns['joint']]
             error += self._biases['joint']
             if joints.resolution:
@@ -367,9 +362,6 @@ _STATE = (
 
 def _variation(name: str, value: Any) -> float:
     """Return the value of a variation, or raise a `ValueError` with the allowed range."""
-    if name not in VARIATIONS:
-        known = ', '.join(VARIATIONS)
-        raise ValueError(f'variation {name!r:.40} is unknown; allowed: {known}')
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
         raise ValueError(f'variation {name}={value!r:.40}; allowed: one finite number')
     if name != 'gravity_direction':
@@ -386,48 +378,22 @@ def _turned(quaternion: Array, turn: Array) -> Array:
     return quaternion_multiply(rotation, quaternion)
 
 
-def _pushed_body(task: Task) -> int:
-    """Return the object, or the gripper or palm in tasks without one."""
-    names = ('object0', 'object', 'robot0:gripper_link', 'robot0:palm')
-    return first_body(task.model, names) or int(task.model.nbody - 1)
-
-
 class _Lever:
     """How far a site moves with the joints, to first order."""
 
     def __init__(self, task: Task, site_name: str) -> None:
-        model = task.model
-        site = model.site(site_name).id
-        body = int(model.site_bodyid[site])
-        joints = [i for i, u in enumerate(task.spec.robot.joint_units) if u == 'rad']
-        dofs = joint_dofs(task)[joints]
-        chain = set(chain_dofs(model, body).tolist())
-        self._errors = [i for i, dof in enumerate(dofs.tolist()) if dof in chain]
+        self._motion = SiteMotion(task, task.model.site(site_name).id)
+        dofs = task.joint_dofs[np.array(task.spec.robot.joint_units) == 'rad']
+        self._errors = np.flatnonzero(np.isin(dofs, self._motion.dofs))
         self._dofs = dofs[self._errors]
-        self._position = task.output('site_xpos')[:, site]
-        self._center = task.output('subtree_com')[:, int(model.body_rootid[body])]
-        self._cdof = task.output('cdof')
 
     def displacement(self, error: Array) -> Array:
         """Return the shift (N, 3), m, for errors (N, angles) of the joints, rad."""
-        weighted = self._cdof[:, self._dofs] * error[:, self._errors, None]
-        spatial = weighted.sum(axis=1)
-        shift: Array = spatial[:, 3:]
-        return shift + np.cross(spatial[:, :3], self._position - self._center)
-
-
-def _levers(task: Task) -> dict[str, list[_Lever]]:
-    return {
-        name: [_Lever(task, site) for site in sites]
-        for name, sites in _LED.items()
-        if name in task.sensors
-    }
+        return self._motion.twist(self._dofs, error[:, self._errors])[0]
 
 
 # Physics of single simulations, by the batch's own model fields
 
-_OBJECTS = ('object0', 'object')
-_TABLE = 'table0'
 # Model fields that each variation changes.
 _FIELDS = {
     'friction': ('geom_friction', 'pair_friction'),
@@ -452,8 +418,8 @@ class VariedPhysics:
 
     def __init__(self, task: Task, physics: PhysicsDisturbance) -> None:
         self._task = task
-        self._body = first_body(task.model, _OBJECTS)
-        self._table = first_body(task.model, (_TABLE,))
+        self._body = first_body(task.model, (task.spec.object_name,))
+        self._table = first_body(task.model, ('table0',))
         self._live: dict[str, Array] = {}
         self._nominal: dict[str, Array] = {}
         off = PhysicsDisturbance()
@@ -548,8 +514,8 @@ class VariedPhysics:
             values[np.ix_(ids, places)] *= factor.reshape(shape)
 
     def _vary_damping(self, ids: Ids, variations: Mapping[str, Array]) -> None:
-        dofs = joint_dofs(self._task)
-        self._live['dof_damping'][np.ix_(ids, dofs)] *= variations['damping'][ids][:, None]
+        factor, places = variations['damping'][ids], np.ix_(ids, self._task.joint_dofs)
+        self._live['dof_damping'][places] *= factor[:, None]
 
     def _vary_gravity_tilt(self, ids: Ids, variations: Mapping[str, Array]) -> None:
         tilt, direction = variations['gravity_tilt'][ids], variations['gravity_direction'][ids]
@@ -565,13 +531,7 @@ class VariedPhysics:
         self._live['body_pos'][ids, self._table, 2] += shift
 
 
-def joint_dofs(task: Task) -> NDArray[np.intp]:
-    """Return the degree of freedom of each joint of the robot, (joints,)."""
-    model = task.model
-    return np.array([int(model.joint(name).dofadr[0]) for name in task.spec.robot.joints])
-
-
-def first_body(model: mujoco.MjModel, names: tuple[str, ...]) -> int:
+def first_body(model: mujoco.MjModel, names: tuple[str | None, ...]) -> int:
     """Return the number of the first of these bodies that the model has, or 0."""
-    numbers = (mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY.value, name) for name in names)
+    numbers = (find(model, mujoco.mjtObj.mjOBJ_BODY, str(name)) for name in names)
     return next((number for number in numbers if number > 0), 0)

@@ -72,6 +72,20 @@ def load_model(relative: str) -> mujoco.MjModel:
     return load_spec(relative).compile()
 
 
+def find(model: mujoco.MjModel, kind: Any, name: str) -> int:
+    """Return the number of an element, such as a body (`mjOBJ_BODY`), or -1 if it is missing."""
+    return int(mujoco.mj_name2id(model, kind.value, name))
+
+
+def free_joint(model: mujoco.MjModel, body: str | None) -> tuple[slice, slice] | tuple[None, None]:
+    """Return the places of a body's free joint in qpos (7) and qvel (6); None if it is missing."""
+    number = find(model, mujoco.mjtObj.mjOBJ_JOINT, f'{body}:joint')
+    if number < 0 or model.jnt_type[number] != mujoco.mjtJoint.mjJNT_FREE.value:
+        return None, None
+    qpos, qvel = int(model.jnt_qposadr[number]), int(model.jnt_dofadr[number])
+    return slice(qpos, qpos + 7), slice(qvel, qvel + 6)
+
+
 def geom_color(model: mujoco.MjModel, geom: int) -> Array:
     """Return the colour (4,) that MuJoCo draws: the geom's own, or that of its material."""
     own = np.array(model.geom_rgba[geom], dtype=np.float64)

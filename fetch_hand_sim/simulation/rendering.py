@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import contextlib
-import operator
 import threading
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from typing import Any, NoReturn
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from fetch_hand_sim.simulation.arguments import require_whole
 from fetch_hand_sim.simulation.opengl import ADVICE, context_of_its_own, prepare_opengl
 from fetch_hand_sim.simulation.scene import SHOWN_SITES, Frame, Scene
 from fetch_hand_sim.simulation.simulation import Simulation
 from msgs_spec.arrays import Array, Picture
 from msgs_spec.parameters import LARGEST_PICTURE_SIDE
+from msgs_spec.text import entries, one_line, one_of
 
 WIDTH, HEIGHT = 640, 480
 LARGEST_SIDE = LARGEST_PICTURE_SIDE
@@ -36,7 +37,6 @@ class SceneRenderer:
 
     Raises:
         ValueError: If the camera is unknown or the size is not allowed.
-        TypeError: If a side is not an integer.
         RuntimeError: If OpenGL is missing.
     """
 
@@ -48,10 +48,7 @@ class SceneRenderer:
         camera: str | Mapping[str, Any] | None = None,
     ) -> None:
         # OpenGL's errors would be misleading.
-        width, height = operator.index(width), operator.index(height)
-        for side in (width, height):
-            if not 1 <= side <= LARGEST_SIDE:
-                raise ValueError(f'size {width}x{height}; allowed: 1 ... {LARGEST_SIDE} pixels')
+        check_size(width, height)
         self._scene = scene
         self._camera = make_camera(scene, camera)
         self._options = make_options()
@@ -125,6 +122,12 @@ def make_options() -> mujoco.MjvOption:
     return options
 
 
+def check_size(width: object, height: object) -> None:
+    """Raise ValueError unless both sides of a picture are 1 ... `LARGEST_SIDE` pixels."""
+    for name, side in (('width', width), ('height', height)):
+        require_whole(name, side, 1, LARGEST_SIDE)
+
+
 def make_camera(scene: Scene, name: str | Mapping[str, Any] | None) -> mujoco.MjvCamera:
     """Return a camera by name, or the view with changed attributes; ValueError if unknown."""
     camera = mujoco.MjvCamera()
@@ -133,52 +136,43 @@ def make_camera(scene: Scene, name: str | Mapping[str, Any] | None) -> mujoco.Mj
         set_attributes(camera, name or {}, scene.model)
         return camera
     names = [scene.model.camera(index).name for index in range(scene.model.ncam)]
-    if name not in names:
-        raise ValueError(f'camera {name!r} is not known; allowed: {", ".join(names) or "none"}')
     camera.type = mujoco.mjtCamera.mjCAMERA_FIXED.value
-    camera.fixedcamid = names.index(name)
+    camera.fixedcamid = names.index(one_of(name, names, 'camera'))
     return camera
 
 
 def set_attributes(
     camera: mujoco.MjvCamera, attributes: Mapping[str, Any], model: mujoco.MjModel
 ) -> None:
-    """Set attributes of a camera of a model; raise ValueError for invalid values."""
-    for name, value in attributes.items():
+    """Set attributes of a camera of a model.
+
+    Raises:
+        ValueError: For values with which MuJoCo renders nothing or ends the process, among others.
+    """
+    known = [name for name in dir(mujoco.MjvCamera) if not name.startswith('_')]
+    for name, value in entries('default_camera_config', attributes, known).items():
+        before = getattr(camera, name)
         try:
             if np.ndim(value):
-                getattr(camera, name)[:] = value
+                before[:] = value
             else:
                 setattr(camera, name, value)
         except (TypeError, ValueError):
-            allowed = f'as {getattr(camera, name)!r}'
-            raise ValueError(
-                f'default_camera_config: {name} {value!r:.60}; allowed: {allowed}'
-            ) from None
-    _check_camera(camera, model)
-
-
-def _check_camera(camera: mujoco.MjvCamera, model: mujoco.MjModel) -> None:
-    """Raise ValueError for values with which MuJoCo renders nothing or ends the process."""
-    for name in ('azimuth', 'distance', 'elevation', 'lookat'):
+            _refuse(name, value, f'as {before!r}')
         if not np.isfinite(getattr(camera, name)).all():
-            raise ValueError(f'default_camera_config: {name} {getattr(camera, name)} is not finite')
+            _refuse(name, value, 'finite numbers')
     kinds = mujoco.mjtCamera
     fixed, tracking = kinds.mjCAMERA_FIXED.value, kinds.mjCAMERA_TRACKING.value
     if camera.type not in (kinds.mjCAMERA_FREE.value, fixed, tracking):
-        raise ValueError(
-            f'default_camera_config: type {camera.type}; allowed: 0 (free), 1 (tracking), 2 (fixed)'
-        )
-    for kind, name, count in (
-        (fixed, 'fixedcamid', model.ncam),
-        (tracking, 'trackbodyid', model.nbody),
-    ):
-        number = getattr(camera, name)
-        if camera.type == kind and not 0 <= number < count:
-            allowed = f'0 ... {count - 1}' if count else 'none'
-            raise ValueError(
-                f'default_camera_config: type {kind} with {name} {number}; allowed: {allowed}'
-            )
+        _refuse('type', camera.type, '0 (free), 1 (tracking), 2 (fixed)')
+    if camera.type == fixed and not 0 <= camera.fixedcamid < model.ncam:
+        _refuse('fixedcamid', camera.fixedcamid, f'0 ... {model.ncam - 1}')
+    if camera.type == tracking and not 0 <= camera.trackbodyid < model.nbody:
+        _refuse('trackbodyid', camera.trackbodyid, f'0 ... {model.nbody - 1}')
+
+
+def _refuse(name: str, value: object, allowed: str) -> NoReturn:
+    raise ValueError(f'default_camera_config: {name} {one_line(value, 40)!r}; allowed: {allowed}')
 
 
 def simulation_frame(simulation: Simulation, index: int = 0) -> Frame:

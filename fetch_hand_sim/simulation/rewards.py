@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from msgs_spec.arrays import Array
 from msgs_spec.rotations import euler_to_quaternion, quaternion_to_euler, rotation_angle
 from msgs_spec.tasks import REWARD_TYPES, SUCCESS_RULES, GoalKind, RewardType, SuccessRule, TaskSpec
+from msgs_spec.text import one_of
 
 
 def _norm(difference: Array) -> Array:
@@ -47,8 +48,8 @@ class GoalMetric:
     reward_type: RewardType = 'sparse'
 
     def __post_init__(self) -> None:
-        _require_choice('success_rule', self.success_rule, SUCCESS_RULES)
-        _require_choice('reward_type', self.reward_type, REWARD_TYPES)
+        one_of(self.success_rule, SUCCESS_RULES, 'success_rule')
+        one_of(self.reward_type, REWARD_TYPES, 'reward_type')
 
     def with_changes(self, **changes: Any) -> Self:
         """Return a copy with other values of some fields.
@@ -151,8 +152,3 @@ class GoalMetric:
             euler[..., 2] = quaternion_to_euler(desired[..., 3:])[..., 2]
             quaternion = euler_to_quaternion(euler)
         return rotation_angle(quaternion, desired[..., 3:], antipodal=self.success_rule == 'paper')
-
-
-def _require_choice(name: str, value: str, allowed: tuple[str, ...]) -> None:
-    if value not in allowed:
-        raise ValueError(f'{name} {value!r:.60} is not known; allowed: {", ".join(allowed)}')

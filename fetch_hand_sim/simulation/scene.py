@@ -15,9 +15,8 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from fetch_hand_sim.simulation.models import geom_color, load_spec
+from fetch_hand_sim.simulation.models import free_joint, geom_color, load_spec
 from fetch_hand_sim.simulation.tasks import task_asset
-from fetch_hand_sim.simulation.tasks.task import joint_qpos_slice
 from msgs_spec.arrays import Array
 from msgs_spec.robots import JOINT_PREFIX
 from msgs_spec.tasks import GoalKind, TaskSpec, task_spec
@@ -148,14 +147,14 @@ class Scene:
         self.view = model_view(self.model) if is_own else default_view(self.spec)
         joints = [self.model.joint(name) for name in self.spec.robot.joints]
         self._joints = np.array([int(joint.qposadr[0]) for joint in joints])
-        self._object = self._free_joint(self.spec.object_name)
-        self._ghost = self._free_joint(GHOST if self.has_ghost else None)
+        self._object = free_joint(self.model, self.spec.object_name)[0]
+        self._ghost = free_joint(self.model, GHOST)[0]
 
     @property
     def has_ghost(self) -> bool:
         """True if the model contains a ghost of the object that shows the goal."""
-        joint = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_JOINT.value, f'{GHOST}:joint')
-        return self.spec.goal is GoalKind.POSE and self.spec.has_object and joint >= 0
+        is_pose = self.spec.goal is GoalKind.POSE
+        return is_pose and self.spec.has_object and self._ghost is not None
 
     def show(self, frame: Frame) -> None:
         """Pose robot, object and ghost, and all other joints if the frame contains them."""
@@ -164,7 +163,7 @@ class Scene:
         self.data.qpos[self._joints] = frame.joint_position
         if self._object is not None and frame.object_pose is not None:
             self.data.qpos[self._object] = frame.object_pose
-        if self._ghost is not None:
+        if self._ghost is not None and self.has_ghost:
             self.data.qpos[self._ghost] = ghost_pose(self.spec, frame.desired_goal)
 
     def markers(self, frame: Frame, trail: Sequence[Array] = ()) -> list[Marker]:
@@ -227,9 +226,6 @@ class Scene:
         tint = (*color[:3], 2.0 * _HALO_OPACITY)
         size = _SHELL_SCALE * np.asarray(geom.size)
         return [Marker(int(geom.type[0]), size, pose[:3], tint, pose[3:])]
-
-    def _free_joint(self, body: str | None) -> slice | None:
-        return None if body is None else joint_qpos_slice(self.model, f'{body}:joint')
 
 
 def ghost_pose(spec: TaskSpec, goal: Array) -> Array:

@@ -13,6 +13,7 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, TypeVar
 
 import mujoco
@@ -25,19 +26,16 @@ from numpy.typing import ArrayLike, NDArray
 from fetch_hand_sim.simulation.arguments import (
     Seeds,
     StartState,
-    finite_goals,
     finite_numbers,
     generators,
     nearest_quaternions,
-    numbers,
     read_start,
     require_whole,
     selected_simulations,
 )
 from fetch_hand_sim.simulation.disturber import Disturber
-from fetch_hand_sim.simulation.models import asset_path
+from fetch_hand_sim.simulation.models import asset_path, find
 from fetch_hand_sim.simulation.tasks import Task, make_task
-from fetch_hand_sim.simulation.tasks.task import DivergenceWatch
 from msgs_spec.arrays import Array
 from msgs_spec.disturbances import Disturbances, read_disturbances
 from msgs_spec.observations import Readings, achieved_goal
@@ -49,6 +47,7 @@ from msgs_spec.tasks import (
     SuccessRule,
     Timing,
 )
+from msgs_spec.text import one_line, one_of
 
 Observation = dict[str, Array]
 # One mapping for all simulations, or one or None for each.
@@ -121,11 +120,10 @@ class Simulation:
         disturbances: Disturbances | Mapping[str, Any] | str | None = None,
     ) -> None:
         require_whole('num_envs', num_envs, lowest=1)
-        require_whole('num_threads', num_threads, lowest=0)
+        require_whole('num_threads', num_threads)
         if not isinstance(keeps_data, bool):
             raise ValueError(f'keeps_data {keeps_data!r:.60}; allowed: True or False')
-        if timing not in TIMINGS:
-            raise ValueError(f'timing {timing!r:.60} is unknown; allowed: {", ".join(TIMINGS)}')
+        one_of(timing, TIMINGS, 'timing')
         self._arguments: dict[str, Any] = {
             'num_envs': num_envs,
             'num_threads': num_threads,
@@ -141,7 +139,6 @@ class Simulation:
         self.timing = timing
         self.metric = self._task.goal_metric(success_rule, reward_type)
         self.divergences = 0
-        self._divergence = DivergenceWatch(self._task.batch)
         self.goals = np.zeros((num_envs, self.spec.goal.size))
         self._generators: list[np.random.Generator | None] = [None] * num_envs
         self._all = np.arange(num_envs)
@@ -149,9 +146,6 @@ class Simulation:
         self._is_started = np.zeros(num_envs, dtype=np.bool_)
         self._process = os.getpid()
         self._disturber: Disturber | None = None
-        # Values given by the user for the episodes that begin now, by simulation.
-        self._given: dict[int, dict[str, float]] = {}
-        self._starts: dict[int, StartState] = {}
         self.disturbances = disturbances
 
     def __repr__(self) -> str:
@@ -169,12 +163,7 @@ class Simulation:
     @goals.setter
     def goals(self, goals: ArrayLike) -> None:
         shape = (self.num_envs, self.spec.goal.size)
-        wanted = numbers(goals, f'goals of {self.spec.name}', f'{shape}')
-        if wanted.shape != shape or wanted.dtype.kind not in 'iuf':
-            raise ValueError(
-                f'goals of {self.spec.name} have shape {shape}, not {wanted.shape} of type '
-                f'{wanted.dtype}'
-            )
+        wanted = finite_numbers(f'goals of {self.spec.name}', goals, shape)
         self._goals = wanted.astype(np.float64, copy=False)
 
     @property
@@ -262,24 +251,21 @@ class Simulation:
             The observations of all N simulations.
 
         Raises:
-            ValueError: If a seed is negative, ids or seeds do not match the simulations, or a
+            ValueError: If a seed is invalid, ids or seeds do not match the simulations, or a
                 variation or start is unknown or impossible; nothing has moved then.
-            TypeError: If a seed is not an integer.
             RuntimeError: If the object never stays on the palm, or this process was forked and
                 lacks the threads of the batch.
         """
         selected = self._select(ids)
         given = self._each_given('variation', variation, selected, self._allowed_variation)
-        starts = self._each_given('start', start, selected, self._read_start)
+        starts = self._each_given(
+            'start', start, selected, lambda each: read_start(each, self._task)
+        )
         fresh = generators(seed, selected)
         for index, generator in zip(selected.tolist(), fresh, strict=True):
             self._generators[index] = generator or self._generators[index]
-        self._given, self._starts = given, starts
-        try:
-            if selected.size:
-                self._start(np.sort(selected))
-        finally:
-            self._given, self._starts = {}, {}
+        if selected.size:
+            self._start(np.sort(selected), given, starts)
         return self.observe()
 
     def step(self, actions: ArrayLike) -> StepResult:
@@ -296,9 +282,9 @@ class Simulation:
         """
         checked = self._finite('actions', actions)
         if checked.size and (np.abs(checked) > 1.0).any():
-            env, part = np.argwhere(np.abs(checked) > 1.0)[0]
+            env, part = np.argwhere(np.abs(checked) > 1.0)[0].tolist()
             raise ValueError(
-                f'actions must lie in [-1, 1]; actions[{env}, {part}] is {checked[env, part]}'
+                f'actions[{env}, {part}] is {checked[env, part]}; allowed: numbers in [-1, 1]'
             )
         return self._result(self._advance(self._task.commands_from_actions(checked)))
 
@@ -341,7 +327,8 @@ class Simulation:
             ids: The n simulations; None for all.
         """
         selected = self._select(ids)
-        wanted = finite_goals(goals, selected.size, self.spec)
+        shape = (selected.size, self.spec.goal.size)
+        wanted = np.array(finite_numbers(f'goals of {self.spec.name}', goals, shape), np.float64)
         if self.spec.goal is GoalKind.POSE:
             wanted = nearest_quaternions(wanted, self._task.observe()[1][selected])
         self.goals[selected] = wanted
@@ -354,14 +341,11 @@ class Simulation:
             wrench: (6,) force in N and torque in N m, world axes, at the centre of mass.
             index: The simulation.
         """
-        if not isinstance(body, str):
-            raise ValueError(f'body {body!r:.60} is not a name; allowed: a movable body')
-        values = numbers(wrench, 'wrench', 'six')
-        if values.shape != (6,) or values.dtype.kind not in 'iuf' or not np.isfinite(values).all():
-            raise ValueError(f'wrench {wrench!r:.60}; allowed: six finite numbers')
-        number = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_BODY.value, body)
+        values = finite_numbers('wrench', wrench, (6,))
+        # MuJoCo crashes if the name is not text.
+        number = find(self.model, mujoco.mjtObj.mjOBJ_BODY, str(body))
         if number < 1 or not self.model.body_weldid[number]:
-            raise ValueError(f'no body {body[:40]!r} that can move')
+            raise ValueError(f'no body {one_line(body, 40)!r} that can move')
         self._pushes[self._index(index), number] = values
         self._is_pushed = True
 
@@ -447,7 +431,7 @@ class Simulation:
             self._model_may_change = True
         self.metric = state['metric']
         self._task.set_physics_state(state['physics'])
-        self._divergence.forget()
+        self._task.take_diverged()
         if self._disturber is not None:
             self._disturber.set_state(state['disturbed'])
         self.goals[:] = state['goals']
@@ -467,36 +451,42 @@ class Simulation:
         pairs = zip(ids.tolist(), each, strict=True)
         return {index: read(value) for index, value in pairs if value is not None}
 
-    def _read_start(self, given: Any) -> StartState:
-        return read_start(given, self._task)
-
     def _allowed_variation(self, variation: Any) -> dict[str, float]:
-        if not isinstance(variation, Mapping):
-            raise ValueError(f'variation {variation!r:.60}; allowed: a mapping of names to numbers')
         if self._disturber is None:
             raise ValueError(
-                f'variation {dict(variation)!r:.60} has no effect on an undisturbed robot; '
+                f'variation {variation!r:.60} has no effect on an undisturbed robot; '
                 "set disturbances, such as 'mild'"
             )
         return self._disturber.allow(variation)
 
-    def _start(self, ids: NDArray[np.intp]) -> None:
-        """Begin episodes of simulations `ids`: state and physics first, then goals."""
+    def _start(
+        self,
+        ids: NDArray[np.intp],
+        given: Mapping[int, Mapping[str, float]] = MappingProxyType({}),
+        starts: Mapping[int, StartState] = MappingProxyType({}),
+    ) -> None:
+        """Begin episodes of simulations `ids`: state and physics first, then goals.
+
+        The user may give values of disturbances and start states by simulation.
+        """
         self._require_threads()
         own = [self.generator(i) for i in ids.tolist()]
-        # A far part of each generator's own sequence: start and goal draw the same without it.
-        streams = [np.random.Generator(_jumped(each)) for each in own] if self._disturber else []
+        streams: list[np.random.Generator] = []
         if self._disturber is not None:
+            # A far part of each generator's own sequence, which no number of draws reaches: start
+            # and goal draw the same without disturbances.
+            sources: list[Any] = [each.bit_generator for each in own]
+            streams = [np.random.Generator(source.jumped()) for source in sources]
             self._disturber.start_nominal(ids)
         self.goals[ids] = self._task.reset(ids, own)
-        if self._starts:
+        if starts:
             batch = self._task.batch
-            for index, start in self._starts.items():
+            for index, start in starts.items():
                 start.write(batch.bind('qpos')[index], batch.bind('qvel')[index])
-            batch.forward(np.array(sorted(self._starts)))
+            batch.forward(np.array(sorted(starts)))
         if self._disturber is not None:
-            self._disturber.start(ids, streams, self._given)
-        self._divergence.forget()
+            self._disturber.start(ids, streams, given)
+        self._task.take_diverged()
         self._is_started[ids] = True
 
     def _sensed(self, observation: Array, achieved_goal: Array) -> Observation:
@@ -511,9 +501,7 @@ class Simulation:
         if not self._is_started.all():
             waiting = np.flatnonzero(~self._is_started).tolist()
             raise ResetNeeded(f'call reset before step: simulations {waiting!s:.60} never were')
-        if not np.isfinite(self._goals).all():
-            env, part = np.argwhere(~np.isfinite(self._goals))[0]
-            raise ValueError(f'goals[{env}, {part}] is {self._goals[env, part]}; allowed: finite')
+        finite_numbers('goals', self._goals, self._goals.shape)
         self._require_threads()
         if self._disturber is not None:
             commands = self._disturber.command(commands)
@@ -527,11 +515,18 @@ class Simulation:
         if self._is_pushed:
             self._pushes[:] = 0.0
             self._is_pushed = False
-        diverged = failed | self._divergence.found()
+        diverged = failed | self._task.take_diverged()
         if self._disturber is not None:
             self._disturber.sense()
         if diverged.any():
-            self._restart(diverged)
+            ids = np.flatnonzero(diverged)
+            self.divergences += ids.size
+            _LOGGER.warning(
+                '%s: MuJoCo reports simulations %s as diverged; they start a new episode',
+                self.spec.name,
+                ids.tolist(),
+            )
+            self._start(ids)
         return diverged
 
     def _result(self, diverged: NDArray[np.bool_]) -> StepResult:
@@ -539,16 +534,6 @@ class Simulation:
         observation = self.observe()
         reward, success = self.metric.evaluate(observation['achieved_goal'], self.goals)
         return StepResult(observation, reward, success, diverged)
-
-    def _restart(self, diverged: NDArray[np.bool_]) -> None:
-        ids = np.flatnonzero(diverged)
-        self.divergences += ids.size
-        _LOGGER.warning(
-            '%s: MuJoCo reports simulations %s as diverged; they start a new episode',
-            self.spec.name,
-            ids.tolist(),
-        )
-        self._start(ids)
 
     @property
     def _pushes(self) -> Array:
@@ -566,7 +551,7 @@ class Simulation:
 
     def _finite(self, name: str, values: ArrayLike) -> NDArray[np.floating]:
         shape = (self.num_envs, self.spec.robot.action_size)
-        return finite_numbers(name, values, shape, owner=self.spec.name)
+        return finite_numbers(name, values, shape)
 
     def _fitting(self, data: Any) -> Any:
         """Return `data` if it belongs to a model of this size; raise `ValueError` otherwise."""
@@ -580,15 +565,8 @@ class Simulation:
 
     def _index(self, index: int) -> int:
         """Return `index` if a simulation has it; raise `ValueError` otherwise."""
-        require_whole('index', index, lowest=0, highest=self.num_envs - 1)
+        require_whole('index', index, highest=self.num_envs - 1)
         return index
 
     def _select(self, ids: ArrayLike | None) -> NDArray[np.intp]:
         return self._all if ids is None else selected_simulations(ids, self.num_envs)
-
-
-def _jumped(generator: np.random.Generator) -> np.random.BitGenerator:
-    """Return a stream that no number of draws from `generator` reaches."""
-    source: Any = generator.bit_generator
-    jumped: np.random.BitGenerator = source.jumped()
-    return jumped

@@ -21,20 +21,18 @@ from fetch_hand_sim.simulation.models import (
     load_spec,
     skip_unread_stages,
 )
-from fetch_hand_sim.simulation.rewards import GoalMetric
 from fetch_hand_sim.simulation.tasks.task import (
     BatchConfig,
     Generators,
     Ids,
+    SiteMotion,
     Task,
-    chain_dofs,
     integration_state,
-    joint_qpos_slice,
 )
 from msgs_spec.arrays import Array
 from msgs_spec.robots import GRIPPER_STEP
 from msgs_spec.rotations import quaternion_multiply
-from msgs_spec.tasks import DEFAULT_CONTROL_HZ, RewardType, SuccessRule, TaskSpec
+from msgs_spec.tasks import DEFAULT_CONTROL_HZ, TaskSpec
 
 # Unnormalised orientation of the gripper, which `fetch_env.py` adds to the mocap quaternion.
 _GRIPPER_ROTATION = np.array([1.0, 0.0, 1.0, 0.0])
@@ -151,9 +149,8 @@ class FetchTask(Task):
         if spec.has_object:
             sites['object'] = 'object0'
         for name, site in sites.items():
-            reader = _SiteReader(self, site)
-            self._sensors |= {f'{name}_pose': reader.pose, f'{name}_twist': reader.twist}
-        self._fingers = self._joint_qpos[-2:]
+            self._add_site(name, model.site(site).id)
+        self._fingers = self.joint_qpos[-2:]
         self._ctrl = self.batch.bind('ctrl')
         self._mocap_pos = self.batch.bind('mocap_pos')
         self._mocap_quat = self.batch.bind('mocap_quat')
@@ -161,6 +158,25 @@ class FetchTask(Task):
         self._gripper_xpos = self.output('xpos')[:, gripper_body]
         self.gripper_rotation = self.output('xquat')[:, gripper_body]
         self.batch.state[:] = self.start_state
+
+    def _add_site(self, name: str, site: int) -> None:
+        """Add sensors of the pose (N, 7) and the velocity (N, 6) of a site, in world axes."""
+        turn = self.model.site_quat[site].copy()
+        is_aligned = bool((turn == [1.0, 0.0, 0.0, 0.0]).all())
+        position: Array = self.output('site_xpos')[:, site]
+        body_quaternion: Array = self.output('xquat')[:, int(self.model.site_bodyid[site])]
+        motion, qvel = SiteMotion(self, site), self._qvel
+
+        def pose(_: Task) -> Array:
+            quaternion = body_quaternion
+            if not is_aligned:
+                quaternion = quaternion_multiply(quaternion, turn)
+            return np.concatenate([position, quaternion], axis=1)
+
+        def twist(_: Task) -> Array:
+            return np.concatenate(motion.twist(motion.dofs, qvel[:, motion.dofs]), axis=1)
+
+        self._sensors |= {f'{name}_pose': pose, f'{name}_twist': twist}
 
     def _settle(self, model: mujoco.MjModel, spec: TaskSpec) -> None:
         """Drive the gripper to its start and store the state after a reset."""
@@ -192,9 +208,9 @@ class FetchTask(Task):
     def reset(self, ids: Ids, generators: Generators) -> Array:
         """Restore the settled state, place the objects and draw goals."""
         self.batch.state[ids] = self.start_state
-        if self.spec.has_object:
+        if self.object_qpos is not None:
             places = [self._sample_object_place(generator) for generator in generators]
-            start = joint_qpos_slice(self.model, 'object0:joint').start
+            start = self.object_qpos.start
             self._qpos[ids, start : start + 2] = places
         self.batch.forward(ids)
         return self.sample_goals(ids, generators)
@@ -261,52 +277,6 @@ class FetchTask(Task):
             if self.config.block_gripper:
                 self._qpos[:, self._fingers] = 0.0
                 self.batch.forward(stage=self._last_stage)
-
-    def goal_metric(self, success_rule: SuccessRule, reward_type: RewardType) -> GoalMetric:
-        """Return the distance to a point."""
-        return GoalMetric(self.spec, success_rule=success_rule, reward_type=reward_type)
-
-
-class _SiteReader:
-    """Pose and velocity of a site, as MuJoCo computed them in its last pass."""
-
-    def __init__(self, task: FetchTask, site_name: str) -> None:
-        model = task.model
-        site = model.site(site_name).id
-        body = int(model.site_bodyid[site])
-        self._site_quaternion = model.site_quat[site].copy()
-        self._site_aligned = bool((self._site_quaternion == [1.0, 0.0, 0.0, 0.0]).all())
-        self._dofs = chain_dofs(model, body)
-        self._position: Array = task.output('site_xpos')[:, site]
-        self._body_quaternion: Array = task.output('xquat')[:, body]
-        self._center = task.output('subtree_com')[:, int(model.body_rootid[body])]
-        self._cdof = task.output('cdof')
-        self._qvel = task.batch.bind('qvel')
-
-    def pose(self) -> Array:
-        """Return world position and orientation wxyz, (N, 7)."""
-        quaternion = self._body_quaternion
-        if not self._site_aligned:
-            site = np.broadcast_to(self._site_quaternion, quaternion.shape)
-            quaternion = quaternion_multiply(quaternion, site)
-        return np.concatenate([self._position, quaternion], axis=1)
-
-    def twist(self) -> Array:
-        """Return linear and angular world velocity, (N, 6): `mj_jacSite` times qvel.
-
-        The sum has a fixed order, so batches of any size give the same bits.
-        """
-        spatial = (self._cdof[:, self._dofs] * self._qvel[:, self._dofs, None]).sum(axis=1)
-        angular, linear = spatial[:, :3], spatial[:, 3:]
-        linear = linear + _cross(angular, self._position - self._center)
-        return np.concatenate([linear, angular], axis=1)
-
-
-def _cross(first: Array, second: Array) -> Array:
-    """Return `np.cross` of (N, 3) arrays with the same bits, but faster."""
-    product = first[:, [1, 2, 0]] * second[:, [2, 0, 1]]
-    product -= first[:, [2, 0, 1]] * second[:, [1, 2, 0]]
-    return product
 
 
 def lead_scale(control_hz: float) -> float:

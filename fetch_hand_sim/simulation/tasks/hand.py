@@ -12,18 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fetch_hand_sim.simulation.models import list_geom_pairs, load_spec, skip_unread_stages
-from fetch_hand_sim.simulation.rewards import GoalMetric
 from fetch_hand_sim.simulation.tasks.task import (
     BatchConfig,
     Generators,
     Ids,
     Task,
     integration_state,
-    weakly,
 )
 from msgs_spec.arrays import Array
 from msgs_spec.robots import FINGERTIPS, command_from_action
-from msgs_spec.tasks import RewardType, SuccessRule, TaskSpec
+from msgs_spec.tasks import TaskSpec
 
 
 def load_hand_model(asset: str) -> mujoco.MjModel:
@@ -52,7 +50,7 @@ class HandTask(Task):
         self._xquat = self.output('xquat')
         self._fingertip_sites = fingertip_sites(model)
         self._fingertip_bodies = model.site_bodyid[self._fingertip_sites]
-        self._sensors['fingertip_poses'] = weakly(self._fingertip_poses)
+        self._sensors['fingertip_poses'] = HandTask._fingertip_poses
 
     def follow_model(self) -> None:
         """Follow the model; actions span `actuator_ctrlrange` once it was written to."""
@@ -83,7 +81,6 @@ class HandTask(Task):
         return np.concatenate([positions, quaternions], axis=2).reshape(self.batch.nsim, -1)
 
 
-REACH_ASSET = 'hand/reach.xml'
 # Meeting point of the fingers relative to the palm, and its standard deviation, m.
 _MEETING_OFFSET = np.array([0.0, -0.09, 0.05])
 _MEETING_SCATTER = 0.005
@@ -128,7 +125,7 @@ class HandReachTask(HandTask):
         palm: (3,) position of the palm, m, world.
     """
 
-    ASSET = REACH_ASSET
+    ASSET = 'hand/reach.xml'
 
     def __init__(self, spec: TaskSpec, batch: BatchConfig) -> None:
         model = load_hand_model(self.ASSET)
@@ -162,7 +159,3 @@ class HandReachTask(HandTask):
         if generator.uniform() < _PROBABILITY_OF_INITIAL_POSE:
             goal = self.start_fingertips
         return goal.flatten()
-
-    def goal_metric(self, success_rule: SuccessRule, reward_type: RewardType) -> GoalMetric:
-        """Return the distance between fingertips."""
-        return GoalMetric(self.spec, success_rule=success_rule, reward_type=reward_type)

@@ -17,18 +17,8 @@ import numpy as np
 from mujoco.batch import SimulationError
 from numpy.typing import NDArray
 
-from fetch_hand_sim.simulation.rewards import GoalMetric
 from fetch_hand_sim.simulation.tasks.hand import HandTask, load_hand_model
-from fetch_hand_sim.simulation.tasks.task import (
-    BatchConfig,
-    DivergenceWatch,
-    Generators,
-    Ids,
-    integration_state,
-    joint_qpos_slice,
-    joint_qvel_slice,
-    weakly,
-)
+from fetch_hand_sim.simulation.tasks.task import BatchConfig, Generators, Ids, integration_state
 from msgs_spec.arrays import Array
 from msgs_spec.robots import resting_command
 from msgs_spec.rotations import (
@@ -39,15 +29,8 @@ from msgs_spec.rotations import (
     quaternion_multiply,
     quaternion_to_matrix,
 )
-from msgs_spec.tasks import (
-    DEFAULT_CONTROL_HZ,
-    RewardType,
-    SuccessRule,
-    TaskSpec,
-    substeps_per_tick,
-)
+from msgs_spec.tasks import DEFAULT_CONTROL_HZ, TaskSpec, substeps_per_tick
 
-_OBJECT_JOINT = 'object:joint'
 _OBJECT_SITE = 'object:center'
 # An object with a lower centre after settling has fallen off the palm, m.
 PALM_HEIGHT = 0.04
@@ -105,12 +88,14 @@ class HandManipulateTask(HandTask):
         self.start_state = integration_state(model, data)
         self._start_qpos = data.qpos.copy()
         super().__init__(spec, model, batch)
-        self._object_qpos = self._qpos[:, joint_qpos_slice(model, _OBJECT_JOINT)]
-        self._object_qvel = self._qvel[:, joint_qvel_slice(model, _OBJECT_JOINT)]
+        assert self.object_qpos is not None and self.object_qvel is not None
+        self._object_start = self._start_qpos[self.object_qpos]
+        self._object_qpos = self._qpos[:, self.object_qpos]
+        self._object_qvel = self._qvel[:, self.object_qvel]
         self._sensors |= {
-            'object_pose': self._object_qpos.copy,
-            'object_twist': weakly(self._object_twist),
-            'object_joint': weakly(self._object_joint),
+            'object_pose': lambda task: task._object_qpos.copy(),
+            'object_twist': HandManipulateTask._object_twist,
+            'object_joint': HandManipulateTask._object_joint,
         }
         self._object_site = model.site(_OBJECT_SITE).id
         self._resting_command = resting_command(spec.robot)
@@ -146,13 +131,14 @@ class HandManipulateTask(HandTask):
 
     def _settle(self, ids: Ids) -> NDArray[np.bool_]:
         """Let objects come to rest; return which simulations diverged, (N,)."""
-        watch, failed = DivergenceWatch(self.batch), np.zeros(self.batch.nsim, dtype=np.bool_)
+        self.take_diverged()
+        failed = np.zeros(self.batch.nsim, dtype=np.bool_)
         for advance in (partial(self.batch.step, nstep=self._settling), self.batch.forward):
             try:
                 advance(ids)
             except SimulationError as error:
                 failed[error.ids] = True
-        return failed | watch.found()
+        return failed | self.take_diverged()
 
     def _start_again(self, ids: Ids) -> None:
         self.batch.bind('time')[ids] = 0.0
@@ -162,8 +148,7 @@ class HandManipulateTask(HandTask):
 
     def _sample_start(self, generator: np.random.Generator) -> Array:
         """Draw the start pose of the object, (7,)."""
-        start = self._start_qpos[joint_qpos_slice(self.model, _OBJECT_JOINT)]
-        position, quaternion = start[:3].copy(), start[3:]
+        position, quaternion = self._object_start[:3].copy(), self._object_start[3:]
         if self.config.randomizes_rotation:
             offset = self._sample_rotation(generator)
             quaternion = quaternion_multiply(quaternion, offset)
@@ -199,10 +184,6 @@ class HandManipulateTask(HandTask):
     def _object_joint(self) -> Array:
         """Return qpos and qvel of the free joint, (N, 13)."""
         return np.concatenate([self._object_qpos, self._object_qvel], axis=1)
-
-    def goal_metric(self, success_rule: SuccessRule, reward_type: RewardType) -> GoalMetric:
-        """Return the distance between poses."""
-        return GoalMetric(self.spec, success_rule=success_rule, reward_type=reward_type)
 
 
 def _parallel_rotations() -> Array:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from fetch_hand_sim.simulation.tasks.fetch import FETCH_CONFIGS, FetchTask
-from fetch_hand_sim.simulation.tasks.hand import REACH_ASSET, HandReachTask
+from fetch_hand_sim.simulation.tasks.hand import HandReachTask
 from fetch_hand_sim.simulation.tasks.hand_manipulate import MANIPULATE_CONFIGS, HandManipulateTask
 from fetch_hand_sim.simulation.tasks.task import BatchConfig, Task
 from msgs_spec.tasks import (
@@ -63,14 +63,10 @@ def _family(spec: TaskSpec) -> Any:
 
 def task_asset(name: str) -> str:
     """Return the MJCF asset of a task, for example `fetch/reach.xml`, or raise ValueError."""
-    spec = task_spec(name)
-    if spec.name in FETCH_CONFIGS:
-        return FETCH_CONFIGS[spec.name].asset
-    if spec.name in MANIPULATE_CONFIGS:
-        return MANIPULATE_CONFIGS[spec.name].asset
-    if spec.name == 'HandReach':
-        return REACH_ASSET
-    named = getattr(third_party_simulation(spec.name), 'ASSET', None)
+    config = FETCH_CONFIGS.get(name) or MANIPULATE_CONFIGS.get(name)
+    if config is not None:
+        return config.asset
+    named = getattr(_family(task_spec(name)), 'ASSET', None)
     if named is None:
-        raise ValueError(f'the simulation of {spec.name} lacks ASSET, its MJCF file')
+        raise ValueError(f'the simulation of {name} lacks ASSET, its MJCF file')
     return str(named)

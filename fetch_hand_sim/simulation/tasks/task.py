@@ -16,7 +16,6 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
-from weakref import WeakMethod
 
 import mujoco
 import numpy as np
@@ -24,7 +23,7 @@ from mujoco import mjtWarning
 from mujoco.batch import Batch
 from numpy.typing import NDArray
 
-from fetch_hand_sim.simulation.models import ListedPairs
+from fetch_hand_sim.simulation.models import ListedPairs, find, free_joint
 from fetch_hand_sim.simulation.rewards import GoalMetric
 from msgs_spec.arrays import Array
 from msgs_spec.observations import Readings, achieved_goal, observation, observed_topics
@@ -72,29 +71,6 @@ def _stop_timers() -> None:
         clock.value = None
 
 
-class DivergenceWatch:
-    """Finds the simulations of a batch that MuJoCo reported as diverged since the last call."""
-
-    def __init__(self, batch: Any) -> None:
-        self._batch = batch
-        self.forget()
-
-    def forget(self) -> None:
-        """Ignore all divergences so far."""
-        # The last axis is (last info, number).
-        self._batch.warning[:, _THROWN_AWAY] = 0
-
-    def found(self) -> NDArray[np.bool_]:
-        """Return which simulations diverged since the last call of this or `forget`, (N,)."""
-        warning = self._batch.warning
-        first, second, third = (warning[:, kind, 1] for kind in _THROWN_AWAY)
-        lost = np.asarray(first + second + third > 0)
-        if lost.any():
-            # MuJoCo throws its counters away with the state: each loss is number one again.
-            self.forget()
-        return lost
-
-
 def keep_in_forks(batch: Batch) -> None:
     """Keep a batch alive in forked processes until they end."""
     if batch.nthread > 1:
@@ -139,20 +115,6 @@ class BatchConfig:
         return min(self.num_threads or len(os.sched_getaffinity(0)), self.num_envs)
 
 
-@dataclass(frozen=True, slots=True)
-class PhysicsState:
-    """State from which a batch continues to the same bits.
-
-    Attributes:
-        rows: (N, state size), `mjSTATE_INTEGRATION` of each simulation.
-        outputs: Derived fields of `MjData` that the task reads, by name, (N, ...) each. After a
-            step they are one substep older than the rows.
-    """
-
-    rows: Array
-    outputs: dict[str, Array]
-
-
 class Task(ABC):
     """One task on a batch of simulations; all arrays have the simulation as leading axis.
 
@@ -163,6 +125,10 @@ class Task(ABC):
         tick_duration: Simulated seconds per action.
         draws_goals: Whether `reset` draws goals; otherwise they are zero until the user sets them.
         start_state: (state size,) `mjSTATE_INTEGRATION` before start and goal are drawn.
+        joint_qpos: Places of the robot's joints in qpos, (joints,).
+        joint_dofs: Places of their velocities in qvel, (joints,).
+        object_qpos: The seven places of the object's free joint in qpos; None without an object.
+        object_qvel: Its six places in qvel.
         ASSET: MJCF asset, for classes whose tasks share one.
     """
 
@@ -189,10 +155,15 @@ class Task(ABC):
         self._qvel: Array = self.batch.bind('qvel')
         self._actuator_force = self.output('qfrc_actuator')
         joints = [_scalar_joint(spec, model, name) for name in spec.robot.joints]
-        self._joint_qpos = np.array([int(joint.qposadr[0]) for joint in joints])
-        self._joint_dofs = np.array([int(joint.dofadr[0]) for joint in joints])
-        # Functions that return the vectors (N, topic.size) of a topic; subclasses add more.
-        self._sensors: dict[str, Callable[[], Array]] = {'joint_states': weakly(self._joint_states)}
+        self.joint_qpos = np.array([int(joint.qposadr[0]) for joint in joints])
+        self.joint_dofs = np.array([int(joint.dofadr[0]) for joint in joints])
+        self.object_qpos: slice | None
+        self.object_qvel: slice | None
+        self.object_qpos, self.object_qvel = free_joint(model, spec.object_name)
+        # Functions of the task that return the vectors (N, topic.size) of a topic. Methods are
+        # stored unbound: a task that holds itself would only be freed by the garbage collector,
+        # which underestimates the memory of a batch.
+        self._sensors: dict[str, Callable[[Any], Array]] = {'joint_states': Task._joint_states}
         self._observed = observed_topics(spec)
 
     @property
@@ -232,9 +203,20 @@ class Task(ABC):
     def resting_commands(self) -> Array:
         """Return the commands (N, action size) that keep the robots as they are."""
 
-    @abstractmethod
     def goal_metric(self, success_rule: SuccessRule, reward_type: RewardType) -> GoalMetric:
         """Return the metric of the task: distances, success and reward."""
+        return GoalMetric(self.spec, success_rule, reward_type)
+
+    def take_diverged(self) -> NDArray[np.bool_]:
+        """Return which simulations diverged since the last call, (N,)."""
+        # The last axis is (last info, number).
+        warning = self.batch.warning
+        first, second, third = (warning[:, kind, 1] for kind in _THROWN_AWAY)
+        lost = np.asarray(first + second + third > 0)
+        if lost.any():
+            # MuJoCo throws its counters away with the state: each loss is number one again.
+            warning[:, _THROWN_AWAY] = 0
+        return lost
 
     def step(self) -> None:
         """Advance all simulations by one tick with the commands applied last."""
@@ -278,26 +260,30 @@ class Task(ABC):
                 f'{self.spec.name} has no sensor {name!r}; allowed: {", ".join(allowed)}'
             )
         is_own = inspect.ismethod(function) and function.__self__ is self
-        self._sensors[name] = weakly(function) if is_own else function
+        unbound: Any = function.__func__ if inspect.ismethod(function) else None
+        self._sensors[name] = unbound if is_own else lambda _: function()
 
     @property
     def sensors(self) -> tuple[str, ...]:
         """Names of the measured topics."""
         return tuple(self._sensors)
 
-    def physics_state(self) -> PhysicsState:
-        """Return a copy of the state and of the derived fields that the task reads."""
-        outputs = {name: values.copy() for name, values in self._outputs.items()}
-        return PhysicsState(self.batch.state.copy(), outputs)
+    def physics_state(self) -> dict[str, Array]:
+        """Return copies of the state (N, state size) and of the derived fields that are read.
 
-    def set_physics_state(self, state: PhysicsState) -> None:
+        After a step, the derived fields (N, ...) are one substep older than the state.
+        """
+        outputs = {name: values.copy() for name, values in self._outputs.items()}
+        return {'state': self.batch.state.copy(), **outputs}
+
+    def set_physics_state(self, state: dict[str, Array]) -> None:
         """Continue from a result of `physics_state`, to the same bits."""
-        self.batch.state[:] = state.rows
+        self.batch.state[:] = state['state']
         # Fills the `MjData` that simulations keep, but changes the warm start.
         self.batch.forward()
-        self.batch.state[:] = state.rows
+        self.batch.state[:] = state['state']
         for name in self._outputs:
-            self._write_output(name, slice(None), state.outputs[name])
+            self._write_output(name, slice(None), state[name])
 
     def new_data(self, state: Array) -> mujoco.MjData:
         """Return an `MjData` in a state (state size,), without derived values."""
@@ -327,7 +313,7 @@ class Task(ABC):
 
     def readings(self, names: Iterable[str] = ()) -> Readings:
         """Return the present sensor readings of some topics, by default of all, in new arrays."""
-        return {name: self._sensors[name]() for name in names or self._sensors}
+        return {name: self._sensors[name](self) for name in names or self._sensors}
 
     def observe(self) -> tuple[Array, Array]:
         """Return the observations (N, observation size) and achieved goals (N, goal size)."""
@@ -342,9 +328,9 @@ class Task(ABC):
         """Return positions, velocities and efforts of the robot's joints, (N, 3 * joints)."""
         return np.concatenate(
             [
-                self._qpos[:, self._joint_qpos],
-                self._qvel[:, self._joint_dofs],
-                self._actuator_force[:, self._joint_dofs],
+                self._qpos[:, self.joint_qpos],
+                self._qvel[:, self.joint_dofs],
+                self._actuator_force[:, self.joint_dofs],
             ],
             axis=1,
         )
@@ -353,7 +339,7 @@ class Task(ABC):
 def _scalar_joint(spec: TaskSpec, model: mujoco.MjModel, name: str) -> Any:
     """Return a hinge or slide joint of the model; raise ValueError, which lists all, otherwise."""
     kinds = (mujoco.mjtJoint.mjJNT_SLIDE.value, mujoco.mjtJoint.mjJNT_HINGE.value)
-    number = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT.value, name)
+    number = find(model, mujoco.mjtObj.mjOBJ_JOINT, name)
     if number < 0 or model.jnt_type[number] not in kinds:
         known = [model.joint(n).name for n in range(model.njnt) if model.jnt_type[n] in kinds]
         raise ValueError(
@@ -361,22 +347,6 @@ def _scalar_joint(spec: TaskSpec, model: mujoco.MjModel, name: str) -> Any:
             f'allowed: {", ".join(known) or "none"}'
         )
     return model.joint(number)
-
-
-def weakly(sensor: Callable[[], Array]) -> Callable[[], Array]:
-    """Return a method in a form that does not keep its object alive.
-
-    A task that holds its own methods would only be freed by the garbage collector, which
-    underestimates the memory of a batch.
-    """
-    method = WeakMethod(sensor)
-
-    def read() -> Array:
-        bound = method()
-        assert bound is not None, 'only the object itself calls it'
-        return bound()
-
-    return read
 
 
 def integration_state(model: mujoco.MjModel, data: mujoco.MjData) -> Array:
@@ -387,29 +357,34 @@ def integration_state(model: mujoco.MjModel, data: mujoco.MjData) -> Array:
     return state
 
 
-def joint_qpos_slice(model: mujoco.MjModel, name: str) -> slice:
-    """Return the seven places of a free joint in qpos."""
-    address = int(model.joint(name).qposadr[0])
-    return slice(address, address + 7)
+class SiteMotion:
+    """Velocity of a site for velocities of joints, as MuJoCo computed it in its last pass."""
 
+    def __init__(self, task: Task, site: int) -> None:
+        model, body = task.model, int(task.model.site_bodyid[site])
+        self._position: Array = task.output('site_xpos')[:, site]
+        self._center = task.output('subtree_com')[:, int(model.body_rootid[body])]
+        self._cdof = task.output('cdof')
+        dofs: list[int] = []
+        while body:
+            first, count = int(model.body_dofadr[body]), int(model.body_dofnum[body])
+            dofs.extend(range(first, first + count))
+            body = int(model.body_parentid[body])
+        # Degrees of freedom that move the site, ascending.
+        self.dofs = np.array(sorted(dofs), dtype=np.intp)
 
-def joint_qvel_slice(model: mujoco.MjModel, name: str) -> slice:
-    """Return the six places of a free joint in qvel."""
-    address = int(model.joint(name).dofadr[0])
-    return slice(address, address + 6)
+    def twist(self, dofs: NDArray[np.intp], velocity: Array) -> tuple[Array, Array]:
+        """Return linear and angular world velocity, (N, 3) each: `mj_jacSite` times `velocity`.
 
+        The sum has a fixed order, so batches of any size give the same bits.
 
-def free_joint(model: mujoco.MjModel) -> int | None:
-    """Return the index of the object's free joint; None without an object."""
-    free = np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE.value)
-    return int(free[0]) if free.size else None
-
-
-def chain_dofs(model: mujoco.MjModel, body: int) -> NDArray[np.intp]:
-    """Return the degrees of freedom that move a body, ascending."""
-    dofs: list[int] = []
-    while body:
-        first, count = int(model.body_dofadr[body]), int(model.body_dofnum[body])
-        dofs.extend(range(first, first + count))
-        body = int(model.body_parentid[body])
-    return np.array(sorted(dofs), dtype=np.intp)
+        Args:
+            dofs: Some of `dofs`, (n,).
+            velocity: Their velocities, (N, n).
+        """
+        spatial = (self._cdof[:, dofs] * velocity[:, :, None]).sum(axis=1)
+        angular, lever = spatial[:, :3], self._position - self._center
+        # `np.cross` gives the same bits, but takes longer.
+        moment = angular[:, [1, 2, 0]] * lever[:, [2, 0, 1]]
+        moment -= angular[:, [2, 0, 1]] * lever[:, [1, 2, 0]]
+        return spatial[:, 3:] + moment, angular

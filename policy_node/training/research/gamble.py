@@ -57,8 +57,8 @@ class GambleSimulation(Simulation):
         """Start episodes as `Simulation.reset` does; the landing is drawn after the goal."""
         return self._seen(super().reset(seed, ids, *given, **options))
 
-    def _start(self, ids: NDArray[np.intp]) -> None:
-        super()._start(ids)
+    def _start(self, ids: NDArray[np.intp], *given: Any) -> None:
+        super()._start(ids, *given)
         for index in ids.tolist():
             self._over[index] = False
             self._landing[index] = self._task.sample_goal(index, self.generator(index))

@@ -121,7 +121,7 @@ def test_a_varied_mass_reaches_the_physics():
         (LATE, {'friction': 100.0}, 'friction=100.0; allowed: a number 0.05 ... 20'),
         (LATE, {'friction': 'high'}, 'high.*allowed: one finite number'),
         (LATE, {'damping': 2.0}, 'FetchPush has no damping'),
-        (LATE, 3, 'allowed: a mapping'),
+        (LATE, 3, "variation: '3' given; allowed: a mapping"),
         (None, {'friction': 1.0}, 'undisturbed'),
     ],
 )

@@ -171,14 +171,17 @@ def test_an_id_makes_its_own_task_only(make_one):
 @pytest.mark.parametrize(
     ('arguments', 'error', 'message'),
     [
-        ({'options': 3}, TypeError, 'a dictionary or None, not 3'),
-        ({'options': {'begin': 0}}, ValueError, "option 'begin' is not known; allowed: goal"),
+        ({'options': 3}, ValueError, "options: '3' given; allowed: a mapping of goal, "),
+        ({'options': {'begin': 0}}, ValueError, "options has no 'begin'; allowed: goal"),
         (
             {'options': {'goal': [0, 0]}},
             ValueError,
-            r'a goal of FetchPush has shape \(3,\) or \(1, 3\), not \(2,\)',
+            r'goal of FetchPush: shape \(2,\) given; .* \(3,\) or \(1, 3\)',
         ),
-        ({'options': {'goal': [0, 0, np.nan]}}, ValueError, 'goals must be finite'),
+        ({'options': {'goal': [0, 0, np.nan]}}, ValueError, r'goal of FetchPush\[2\] is nan'),
+        ({'options': {'goal': [1, [2], 3]}}, ValueError, r'goal of FetchPush: \[1, \[2\], 3\]'),
+        ({'options': {'goal': {'x': 1}}}, ValueError, "goal of FetchPush: {'x': 1} given"),
+        ({'options': {'goal': None}}, ValueError, 'goal of FetchPush: None given'),
         ({'seed': -1}, gymnasium.error.Error, 'greater or equal to zero'),
         ({'seed': 'one'}, gymnasium.error.Error, 'must be a python integer'),
     ],
@@ -198,8 +201,8 @@ def test_bad_resets_move_nothing(arguments, error, message):
         (np.zeros(3), r'an action of FetchPush has shape \(4,\), not \(3,\)'),
         (5, r'an action of FetchPush has shape \(4,\), not \(\)'),
         (np.zeros((1, 4)), r'has shape \(4,\), not \(1, 4\)'),
-        (np.full(4, np.nan), 'actions must be finite'),
-        (['up'] * 4, 'actions must be numbers'),
+        (np.full(4, np.nan), r'actions\[0, 0\] is nan'),
+        (['up'] * 4, 'actions: .*up.* given'),
     ],
 )
 def test_bad_actions_move_nothing(action, message):
@@ -316,29 +319,32 @@ def test_importing_the_package_registers_without_mujoco():
 @pytest.mark.parametrize(
     ('arguments', 'message'),
     [
-        ({'render_mode': 'ansi'}, "'ansi' is not known; allowed: None, human, rgb_array, depth_"),
-        ({'height': 0}, r'height must be 1 \.\.\. 4096 pixels, not 0'),
-        ({'width': 1.5}, 'width must be a whole number, not 1.5'),
+        ({'render_mode': 'ansi'}, "render_mode 'ansi'; allowed: human, rgb_array, depth_"),
+        ({'height': 0}, r'height 0; allowed: whole numbers 1 \.\.\. 4096'),
+        ({'width': 1.5}, 'width 1.5; allowed: whole'),
         ({'default_camera_config': {'distance': 'a'}}, r"distance 'a'; allowed: as \d"),
-        ({'default_camera_config': {'lookat': [np.nan] * 3}}, r'lookat \[nan nan nan\] is not fin'),
-        ({'default_camera_config': {'type': 3}}, r'type 3; allowed: 0 \(free\), 1 \(trac'),
-        ({'default_camera_config': {'type': 2}}, r'type 2 with fixedcamid -1; allowed: 0 \.'),
+        (
+            {'default_camera_config': {'lookat': [np.nan] * 3}},
+            'lookat .*nan.*: finite',
+        ),
+        ({'default_camera_config': {'type': 3}}, r"type '3'; allowed: 0 \(free\), 1 \(trac"),
+        ({'default_camera_config': {'type': 2}}, r"fixedcamid '-1'; allowed: 0 \."),
         (
             {'default_camera_config': {'type': 2, 'fixedcamid': 99}},
-            r'fixedcamid 99; allowed: 0 \.\.\. \d',
+            r"fixedcamid '99'; allowed: 0 \.\.\. \d",
         ),
         (
             {'default_camera_config': {'type': 1, 'trackbodyid': 9999}},
-            r'type 1 with trackbodyid 9999; allowed: 0 \.',
+            r"trackbodyid '9999'; allowed: 0 \.",
         ),
         ({'reward_type': 'shaped'}, "reward_type 'shaped'"),
         ({'success_rule': 'mine'}, "success_rule 'mine'"),
         ({'distance_threshold': 'a'}, r'must be 0 ... 1e\+06, not a'),
         ({'control_hz': 26}, 'control_hz 26'),
         ({'control_hz': '25'}, "control_hz '25' given"),
-        ({'default_camera_config': 5}, 'default_camera_config 5; allowed: a mapping or None'),
+        ({'default_camera_config': 5}, "default_camera_config: '5' given; allowed: a mapping"),
         ({'disturbances': 'x' * 1000}, 'is neither a file nor a preset'),
-        ({'default_camera_config': {'zoom': 2}}, "'zoom' is not known; allowed: azimuth,"),
+        ({'default_camera_config': {'zoom': 2}}, "has no 'zoom'; allowed: azimuth,"),
     ],
 )
 def test_bad_arguments_are_refused(arguments, message):
@@ -570,13 +576,13 @@ def test_a_goal_is_as_many_finite_numbers_as_the_task_has(goal):
     env = gymnasium.make('fetch_hand_sim/FetchReach-v0').unwrapped
     env.reset(seed=0)
     before = env.goal.copy()
-    with pytest.raises(ValueError, match='a goal of FetchReach is 3 finite numbers, not '):
+    with pytest.raises(ValueError, match='goal of FetchReach'):
         env.goal = goal
     assert env.goal.tolist() == before.tolist()
     batch = gymnasium.make_vec(
         'fetch_hand_sim/FetchReach-v0', num_envs=2, vectorization_mode='vector_entry_point'
     )
-    with pytest.raises(ValueError, match='a goal of FetchReach is 3 finite numbers, not '):
+    with pytest.raises(ValueError, match='goals of FetchReach'):
         batch.set_attr('goal', [goal, goal])
 
 
@@ -615,31 +621,3 @@ def test_a_task_that_was_not_known_at_first_is_registered_when_it_is_made(monkey
     """As where its package imports this one before its specification is read."""
     monkeypatch.delitem(gymnasium.registry, environment_id('FetchPush'))
     assert fetch_hand_sim.make('FetchPush').spec.id == environment_id('FetchPush')
-
-
-@pytest.mark.parametrize('goal', [[1, [2], 3], {'x': 1}, None])
-def test_a_goal_that_is_no_numbers_is_named(goal):
-    env = fetch_hand_sim.make('FetchReach')
-    with pytest.raises(ValueError, match=r'a goal of FetchReach: \(3,\) or \(1, 3\) numbers, not '):
-        env.reset(options={'goal': goal})
-
-
-def test_a_disturbed_environment_senses_late_and_rewards_the_true_state() -> None:
-    env = make('FetchReach', disturbances='hardware')
-    check_env(env.unwrapped, skip_render_check=True)
-    plain = make('FetchReach')
-    disturbed, _ = env.reset(seed=3)
-    true, _ = plain.reset(seed=3)
-    assert (disturbed['desired_goal'] == true['desired_goal']).all()
-    assert (disturbed['observation'] != true['observation']).any()
-    off = make('FetchReach', disturbances='none')
-    assert (off.reset(seed=3)[0]['observation'] == true['observation']).all()
-    with pytest.raises(ValueError, match='allowed: none, mild, hardware, severe'):
-        make('FetchReach', disturbances='hard')
-
-
-def test_a_batch_takes_disturbances_too() -> None:
-    pair = [fetch_hand_sim.make_vec('FetchPush', 2, disturbances=each) for each in ('severe', None)]
-    first, second = (env.reset(seed=3)[0] for env in pair)
-    assert (first['desired_goal'] == second['desired_goal']).all()
-    assert (first['observation'] != second['observation']).any()

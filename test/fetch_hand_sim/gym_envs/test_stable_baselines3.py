@@ -100,8 +100,8 @@ def test_goals_are_asked_for_once_as_of_a_dummy_vec_env():
 def test_a_refused_option_is_forgotten():
     env = FetchHandVecEnv('FetchReach', 2)
     for options, line in (
-        ({'gaol': [0.0] * 3}, "'gaol' is not known; allowed: goal"),
-        ([{}, {'goal': [np.nan] * 3}], 'finite'),
+        ({'gaol': [0.0] * 3}, "has no 'gaol'; allowed: goal"),
+        ([{}, {'goal': [np.nan] * 3}], 'nan'),
     ):
         env.set_options(options)
         with pytest.raises(ValueError, match=line):

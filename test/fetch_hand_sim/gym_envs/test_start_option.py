@@ -125,12 +125,12 @@ NAMES = 'allowed: joints, joint_velocities, object_pose, object_velocity'
 @pytest.mark.parametrize(
     ('task', 'start', 'line'),
     [
-        ('FetchPush', 0, f"^start '0'; allowed: a mapping of {NAMES[9:]}$"),
+        ('FetchPush', 0, f"^start: '0' given; allowed: a mapping of {NAMES[9:]}$"),
         ('FetchPush', {'object': POSE}, f"start has no 'object'; {NAMES}; did you mean 'object_p"),
-        ('FetchPush', {'object_pose': POSE[:3]}, 'object_pose=.*; allowed: 7 finite numbers$'),
-        ('FetchPush', {'object_pose': 'here'}, 'object_pose=here; allowed: 7 finite numbers$'),
-        ('FetchPush', {'object_pose': [np.nan] * 7}, 'allowed: 7 finite numbers$'),
-        ('FetchPush', {'object_pose': [99.0, *POSE[1:]]}, 'object_pose=.99.*: -10 ... 10 each$'),
+        ('FetchPush', {'object_pose': POSE[:3]}, r'object_pose: shape \(3,\) given; .* \(7,\)$'),
+        ('FetchPush', {'object_pose': 'here'}, r'object_pose: here given; .* shape \(7,\)$'),
+        ('FetchPush', {'object_pose': [np.nan] * 7}, r'object_pose\[0\] is nan; allowed'),
+        ('FetchPush', {'object_pose': [99.0, *POSE[1:]]}, 'object_pose: .99.*: -10 ... 10$'),
         ('FetchPush', {'object_pose': [*POSE[:3], 0, 0, 0, 0]}, 'a quaternion of zeros; allowed'),
         (
             'FetchPush',
@@ -139,17 +139,21 @@ NAMES = 'allowed: joints, joint_velocities, object_pose, object_velocity'
         ),
         ('FetchPush', {'object_velocity': [0.0] * 6}, 'object_velocity without object_pose'),
         ('FetchReach', {'object_pose': POSE}, 'FetchReach has no object; allowed: joints, joint_v'),
-        ('HandReach', {'joints': {'robot0:FFJ9': 0}}, "no joint 'robot0:FFJ9'; allowed: .*did you"),
+        ('HandReach', {'joints': {'robot0:FFJ9': 0}}, "no 'robot0:FFJ9'; allowed: .*did you"),
         (
             'HandReach',
             {'joints': {'robot0:FFJ3': 9}},
-            'robot0:FFJ3 at 9; allowed: -0.349 ... 0.349',
+            'robot0:FFJ3: 9.0 given; allowed: -0.369 ... 0.369',
         ),
-        ('HandReach', {'joints': [0.0] * 3}, 'start joints=.*; allowed: 24 finite numbers$'),
+        (
+            'HandReach',
+            {'joints': [0.0] * 3},
+            r'start joints: shape .3,. given; .*\(24,\)$',
+        ),
         (
             'HandReach',
             {'joint_velocities': {'robot0:FFJ3': 1e9}},
-            'joint_velocities of robot0:FFJ3=.*; allowed: -100 ... 100 each$',
+            'joint_velocities robot0:FFJ3: .*; allowed: -100 ... 100$',
         ),
     ],
 )

@@ -108,7 +108,7 @@ def test_actions_of_those_who_only_begin_count_for_nothing():
     twin = copy.deepcopy(env)
     first = env.step(np.full((2, 4), np.nan, np.float32))
     assert_same(first[0], twin.step(np.ones((2, 4), np.float32))[0])
-    with pytest.raises(ValueError, match='finite'):
+    with pytest.raises(ValueError, match='is nan'):
         env.step(np.full((2, 4), np.nan, np.float32))
 
 
@@ -288,11 +288,11 @@ def test_episodes_have_the_goals_that_their_reset_was_given():
     one = {'goal': np.array([1.3, 0.7, 0.6])}
     assert_same(env.reset(seed=0, options=one)[0], reference.reset(seed=0, options=one)[0])
     mask, goals = np.array([False, True, True]), np.arange(9.0).reshape(3, 3)
-    goals[0] = np.nan
+    goals[0] = 7.0
     observation, _ = env.reset(options={'reset_mask': mask, 'goal': goals})
     assert observation['desired_goal'].tolist() == [[1.3, 0.7, 0.6], [3, 4, 5], [6, 7, 8]]
     before = state_of(env)
-    with pytest.raises(ValueError, match=r'shape \(3,\) or \(3, 3\), not \(2, 3\)'):
+    with pytest.raises(ValueError, match=r'shape \(2, 3\) given; .* \(3,\) or \(3, 3\)'):
         env.reset(options={'reset_mask': mask, 'goal': goals[1:]})
     assert state_of(env) == before
 
@@ -383,11 +383,11 @@ def test_what_was_lost_can_be_asked_of_one_step_and_of_many():
 
 
 BAD_RESETS = {
-    'options': ({'options': [1]}, TypeError, r'a dictionary or None, not \[1\]'),
+    'options': ({'options': [1]}, ValueError, r"options: '\[1\]' given; allowed: a mapping"),
     'unknown option': (
         {'options': {'ids': [0]}},
         ValueError,
-        "'ids' is not known; allowed: reset_",
+        "options has no 'ids'; allowed: goal, ",
     ),
     'mask type': ({'options': {'reset_mask': [True, False]}}, TypeError, 'is a boolean array'),
     'mask of numbers': ({'options': {'reset_mask': np.ones(2)}}, TypeError, 'is a boolean array'),
@@ -402,7 +402,7 @@ BAD_RESETS = {
         'reset_mask names no environment',
     ),
     'negative seed': ({'seed': -5}, ValueError, 'seed -5; allowed'),
-    'seed that is none': ({'seed': True}, TypeError, 'not True'),
+    'seed that is none': ({'seed': True}, ValueError, 'seed True; allowed'),
     'too many seeds': ({'seed': [1, 2, 3]}, ValueError, '2 environments take as many seeds, not 3'),
 }
 
@@ -430,14 +430,9 @@ def test_bad_actions_move_nothing():
     env = make_vec('HandReach', 2)
     env.reset(seed=0)
     before = state_of(env)
-    with pytest.raises(ValueError, match=r'shape \(2, 20\), not \(2, 4\)'):
+    with pytest.raises(ValueError, match=r'shape \(2, 4\) given; .* \(2, 20\)'):
         env.step(np.zeros((2, 4)))
     assert state_of(env) == before
-
-
-def test_an_episode_has_at_least_one_step():
-    with pytest.raises(ValueError, match='must be at least 1, or -1 for no limit, not 0'):
-        make_vec('FetchReach', 2, max_episode_steps=0)
 
 
 def test_arguments_of_gymnasium_are_those_of_its_vectorisation():
@@ -463,14 +458,11 @@ def test_the_first_reset_is_one_of_all():
 @pytest.mark.parametrize(
     ('arguments', 'message'),
     [
-        (
-            {'autoreset_mode': 'Never'},
-            "'Never' is not known; allowed: NextStep, SameStep, D",
-        ),
-        ({'render_mode': 'human'}, "'human' is not known; allowed: None, rgb_array, depth_array"),
-        ({'max_episode_steps': 1.5}, 'max_episode_steps must be a whole number, not 1.5'),
-        ({'num_threads': 1.5}, 'num_threads must be a whole number, not 1.5'),
-        ({'num_threads': True}, 'num_threads must be a whole number, not True'),
+        ({'autoreset_mode': 'Never'}, "mode 'Never'; allowed: NextStep, SameStep, D"),
+        ({'render_mode': 'human'}, "render_mode 'human'; allowed: rgb_array, depth_array"),
+        ({'max_episode_steps': 1.5}, 'max_episode_steps .*1.5; allowed: whole'),
+        ({'max_episode_steps': 0}, r'max_episode_steps \(-1 for no limit\) 0; allowed: whole'),
+        ({'num_threads': True}, 'num_threads True; allowed: whole'),
         ({'distance_threshold': -1}, r'distance_threshold must be 0 ... 1e\+06, not -1'),
     ],
 )

@@ -209,7 +209,7 @@ def test_a_parameter_of_a_metric_of_its_own_outlives_changes_copies_and_pickles(
         assert other.reward(*goals).tobytes() == mine.reward(*goals).tobytes()
     changed = mine.with_changes(spec=wider)
     assert (changed.spec, mine.spec) == (wider, spec)
-    with pytest.raises(ValueError, match="reward_type 'denser' is not known"):
+    with pytest.raises(ValueError, match="reward_type 'denser'"):
         mine.with_changes(reward_type='denser')
 
 
