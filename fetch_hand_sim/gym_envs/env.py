@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import Any
 
 import gymnasium
@@ -10,12 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fetch_hand_sim.gym_envs.pictures import RENDER_MODES, Image
-from fetch_hand_sim.gym_envs.task_attributes import (
-    TaskAttributes,
-    action_space,
-    clip_actions,
-    observation_space,
-)
+from fetch_hand_sim.gym_envs.task_attributes import TaskAttributes, clip_actions
 from fetch_hand_sim.simulation import Observation, Simulation
 from fetch_hand_sim.simulation.arguments import finite_numbers
 from msgs_spec.arrays import Array
@@ -45,11 +41,11 @@ class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32
         'render_fps': int(DEFAULT_CONTROL_HZ),
     }
 
-    def __init__(self, task: str, *args: Any, **arguments: Any) -> None:
-        super().__init__(task, *args, num_threads=1, keeps_data=True, **arguments)
-        self.observation_space = observation_space(self.spec_of_task)
-        self.action_space = action_space(self.spec_of_task)
-        self._physics = SharedPhysics(self.simulation)
+    _batch = {'num_threads': 1, 'keeps_data': True}  # noqa: RUF012
+
+    @cached_property
+    def _physics(self) -> SharedPhysics:
+        return SharedPhysics(self.simulation)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

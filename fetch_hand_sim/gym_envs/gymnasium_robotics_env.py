@@ -12,8 +12,8 @@ import functools
 import io
 import itertools
 import os
-from collections.abc import Iterator, Mapping, Sequence
-from functools import cached_property
+from collections.abc import Mapping, Sequence
+from functools import cached_property, partial
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
@@ -26,7 +26,7 @@ from fetch_hand_sim.gym_envs.env import FetchHandEnv
 from fetch_hand_sim.gym_envs.pictures import RENDER_MODES, Image
 from fetch_hand_sim.gym_envs.vector_env import FetchHandVectorEnv
 from fetch_hand_sim.simulation import Observation
-from fetch_hand_sim.simulation.models import asset_path
+from fetch_hand_sim.simulation.models import asset_path, find
 from fetch_hand_sim.simulation.opengl import prepare_opengl
 from fetch_hand_sim.simulation.tasks.fetch import FETCH_CONFIGS, FetchTask
 from fetch_hand_sim.simulation.tasks.hand import HandReachTask, fingertip_sites
@@ -36,7 +36,8 @@ from fetch_hand_sim.simulation.tasks.hand_manipulate import (
     HandManipulateTask,
 )
 from msgs_spec.arrays import Array, Flags
-from msgs_spec.tasks import GoalKind, RewardType, task_spec
+from msgs_spec.tasks import GoalKind, task_spec
+from msgs_spec.text import one_of
 
 
 def _is_ours(spec: gymnasium.envs.registration.EnvSpec) -> bool:
@@ -105,6 +106,10 @@ def _refusal(hook: str) -> str:
     )
 
 
+def _camera(task: str, changes: Mapping[str, Any] | None) -> dict[str, Any]:
+    return {**CAMERAS[task_spec(task).robot.name], **(changes or {})}
+
+
 def as_reference(reward: Any, reward_type: str) -> Any:
     """A reward, or an array of them, with the reference's type: float32 if it is sparse."""
     return reward.astype(np.float32) if reward_type == 'sparse' else reward
@@ -127,10 +132,6 @@ class RobotEnv(FetchHandEnv, GoalEnv):
     def __init__(
         self,
         task: str,
-        reward_type: RewardType = 'sparse',
-        render_mode: str | None = None,
-        width: int = SIZE,
-        height: int = SIZE,
         default_camera_config: Mapping[str, Any] | None = None,
         **arguments: Any,
     ) -> None:
@@ -138,17 +139,11 @@ class RobotEnv(FetchHandEnv, GoalEnv):
         for name in _NOT_ASKED:
             if hasattr(self, name):
                 raise TypeError(_refusal(name))
-        self._camera = {**CAMERAS[task_spec(task).robot.name], **(default_camera_config or {})}
         self._mujoco_renderer: Any = None
-        super().__init__(
-            task,
-            reward_type=reward_type,
-            render_mode=render_mode,
-            width=width,
-            height=height,
-            default_camera_config=self._camera,
-            **arguments,
-        )
+        self._camera = _camera(task, default_camera_config)
+        pictures: dict[str, Any] = {'width': SIZE, 'height': SIZE}
+        pictures['default_camera_config'] = self._camera
+        super().__init__(task, **pictures | arguments)
         physics = self.simulation.task
         self._target_sites = _sites(physics.model, 'target')
         self._finger_sites = _sites(physics.model, 'finger')
@@ -459,11 +454,8 @@ make_env.metadata = RobotEnv.metadata  # type: ignore[attr-defined]
 
 def _sites(model: mujoco.MjModel, prefix: str) -> list[int]:
     """Return the sites `<prefix>0`, `<prefix>1`, ... of a model."""
-    names = itertools.takewhile(
-        lambda name: mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE.value, name) >= 0,
-        (f'{prefix}{number}' for number in itertools.count()),
-    )
-    return [model.site(name).id for name in names]
+    found = (find(model, mujoco.mjtObj.mjOBJ_SITE, f'{prefix}{i}') for i in itertools.count())
+    return list(itertools.takewhile(lambda site: site >= 0, found))
 
 
 def _goal_kind(task: str) -> tuple[str, str]:
@@ -474,13 +466,9 @@ def _goal_kind(task: str) -> tuple[str, str]:
 
 def task_with_goals(task: str, position: str | None, rotation: str | None) -> str:
     """The task of the same object with other goals."""
-    if task not in MANIPULATE_CONFIGS:
-        raise ValueError(
-            f'task {task!r} has no object in the hand; allowed: {", ".join(MANIPULATE_CONFIGS)}'
-        )
-    own = _goal_kind(task)
+    one_of(task, list(MANIPULATE_CONFIGS), 'task')
+    own, asset = _goal_kind(task), MANIPULATE_CONFIGS[task].asset
     wanted = (position or own[0], rotation or own[1])
-    asset = MANIPULATE_CONFIGS[task].asset
     kinds = {
         _goal_kind(name): name
         for name, config in MANIPULATE_CONFIGS.items()
@@ -489,8 +477,7 @@ def task_with_goals(task: str, position: str | None, rotation: str | None) -> st
     if wanted not in kinds:
         allowed = ', '.join(' and '.join(kind) for kind in kinds)
         raise ValueError(
-            f'target_position {wanted[0]!r} and target_rotation {wanted[1]!r} are not there '
-            f'together; allowed: {allowed}'
+            f'target_position {wanted[0]!r} and target_rotation {wanted[1]!r}; allowed: {allowed}'
         )
     return task if wanted == own else kinds[wanted]
 
@@ -504,8 +491,6 @@ class GymnasiumRoboticsVectorEnv(FetchHandVectorEnv):
         num_envs: int = 1,
         target_position: str | None = None,
         target_rotation: str | None = None,
-        width: int = SIZE,
-        height: int = SIZE,
         default_camera_config: Mapping[str, Any] | None = None,
         **arguments: Any,
     ) -> None:
@@ -513,15 +498,9 @@ class GymnasiumRoboticsVectorEnv(FetchHandVectorEnv):
             task = task_with_goals(task, target_position, target_rotation)
         elif target_position is not None or target_rotation is not None:
             raise TypeError(f'{task} takes neither target_position nor target_rotation')
-        camera = {**CAMERAS[task_spec(task).robot.name], **(default_camera_config or {})}
-        super().__init__(
-            task,
-            num_envs=num_envs,
-            width=width,
-            height=height,
-            default_camera_config=camera,
-            **arguments,
-        )
+        camera = _camera(task, default_camera_config)
+        pictures: dict[str, Any] = {'width': SIZE, 'height': SIZE, 'default_camera_config': camera}
+        super().__init__(task, num_envs=num_envs, **pictures | arguments)
 
     def reset(
         self,
@@ -572,32 +551,26 @@ def mujoco_utils() -> Any:
     """Return the names of `gymnasium_robotics.utils.mujoco_utils` with working joint functions.
 
     Its own fail with MuJoCo 3.12 and later, where `model.jnt_type[i] == mjtJoint.mjJNT_HINGE` is
-    False for every hinge and slide joint.
+    False for every hinge and slide joint. `get_joint_qpos` returns (1,) rad or m, (4,) of a ball,
+    (7,) of a free joint; `get_joint_qvel` (1,), (3,), (6,) per second; the setters take the same.
     """
     from gymnasium_robotics.utils import mujoco_utils as reference
 
-    working = (get_joint_qpos, get_joint_qvel, set_joint_qpos, set_joint_qvel, robot_get_obs)
-    return SimpleNamespace(**vars(reference) | {each.__name__: each for each in working})
+    working: dict[str, Any] = {'robot_get_obs': robot_get_obs}
+    for kind in ('qpos', 'qvel'):
+        working[f'get_joint_{kind}'] = partial(_get_joint, kind)
+        working[f'set_joint_{kind}'] = partial(_set_joint, kind)
+    return SimpleNamespace(**vars(reference) | working)
 
 
-def get_joint_qpos(model: mujoco.MjModel, data: mujoco.MjData, name: str) -> Array:
-    """Return the position of a joint: (1,) rad or m, (4,) of a ball, (7,) of a free joint."""
-    return np.array(_joint_values(model, data, name, 'qpos'))
+def _get_joint(kind: str, model: mujoco.MjModel, data: mujoco.MjData, name: str) -> Array:
+    return np.array(_joint_values(model, data, name, kind))
 
 
-def get_joint_qvel(model: mujoco.MjModel, data: mujoco.MjData, name: str) -> Array:
-    """Return the velocity of a joint: (1,) rad/s or m/s, (3,) of a ball, (6,) of a free joint."""
-    return np.array(_joint_values(model, data, name, 'qvel'))
-
-
-def set_joint_qpos(model: mujoco.MjModel, data: mujoco.MjData, name: str, value: ArrayLike) -> None:
-    """Set the position of a joint, in the form that `get_joint_qpos` returns."""
-    _joint_values(model, data, name, 'qpos')[:] = value
-
-
-def set_joint_qvel(model: mujoco.MjModel, data: mujoco.MjData, name: str, value: ArrayLike) -> None:
-    """Set the velocity of a joint, in the form that `get_joint_qvel` returns."""
-    _joint_values(model, data, name, 'qvel')[:] = value
+def _set_joint(
+    kind: str, model: mujoco.MjModel, data: mujoco.MjData, name: str, value: ArrayLike
+) -> None:
+    _joint_values(model, data, name, kind)[:] = value
 
 
 def robot_get_obs(
@@ -605,9 +578,11 @@ def robot_get_obs(
 ) -> tuple[Array, Array]:
     """Return positions and velocities of the joints whose names begin with `robot`."""
     names = [name for name in joint_names if name.startswith('robot')]
-    qpos = [get_joint_qpos(model, data, name) for name in names]
-    qvel = [get_joint_qvel(model, data, name) for name in names]
-    return np.squeeze(np.array(qpos)), np.squeeze(np.array(qvel))
+    qpos, qvel = (
+        np.squeeze(np.array([_get_joint(kind, model, data, name) for name in names]))
+        for kind in ('qpos', 'qvel')
+    )
+    return qpos, qvel
 
 
 def mujoco_renderer(
@@ -624,8 +599,14 @@ def mujoco_renderer(
         def _get_viewer(self, render_mode: str | None) -> Any:
             if render_mode == 'human':
                 return super()._get_viewer(render_mode)
-            with _opengl_backend(prepare_opengl()):
+            # The only choice of a backend that Gymnasium reads.
+            before = os.environ.get('MUJOCO_GL')
+            os.environ['MUJOCO_GL'] = prepare_opengl()
+            try:
                 viewer = super()._get_viewer(render_mode)
+            finally:
+                del os.environ['MUJOCO_GL']
+                os.environ.update({} if before is None else {'MUJOCO_GL': before})
             # Another environment may have drawn in between.
             viewer.make_context_current()
             return viewer
@@ -641,22 +622,8 @@ def depth_in_metres(model: mujoco.MjModel, depth: Any) -> Any:
     return (near / (1.0 - depth * (1.0 - near / far))).astype(np.float32)
 
 
-@contextlib.contextmanager
-def _opengl_backend(backend: str) -> Iterator[None]:
-    """Set `MUJOCO_GL`, the only choice of a backend that Gymnasium reads."""
-    before = os.environ.get('MUJOCO_GL')
-    os.environ['MUJOCO_GL'] = backend
-    try:
-        yield
-    finally:
-        if before is None:
-            del os.environ['MUJOCO_GL']
-        else:
-            os.environ['MUJOCO_GL'] = before
-
-
 def _joint_values(model: mujoco.MjModel, data: mujoco.MjData, name: str, kind: str) -> Any:
     """Return the entries of `qpos` or `qvel` that belong to a joint, live."""
-    if mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT.value, name) < 0:
+    if find(model, mujoco.mjtObj.mjOBJ_JOINT, name) < 0:
         raise ValueError(f'the model has no joint {name!r}')
     return getattr(data.joint(name), kind)

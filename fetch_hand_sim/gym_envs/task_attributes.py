@@ -46,13 +46,15 @@ class TaskAttributes:
         rotation_threshold: Success within this rotation, radians; None for the task's own.
         disturbances: Delays, noise, other physics: a preset (`hardware`, `hardware*0.5`), a
             mapping, a JSON or YAML file or `Disturbances`; None for an undisturbed robot.
-        **batch: Size of the batch, see `Simulation`.
+        **batch: Further arguments of `Simulation`, for subclasses.
 
     Raises:
         ValueError: If an argument is not allowed.
     """
 
     metadata: dict[str, Any]
+    # Size of the batch, as arguments of `Simulation`.
+    _batch: Mapping[str, Any] = {}
     _spec: EnvSpec | None = None
 
     def __init__(
@@ -78,12 +80,14 @@ class TaskAttributes:
             success_rule=success_rule,
             control_hz=control_hz,
             disturbances=disturbances,
-            **batch,
+            **{**self._batch, **batch},
         )
         self.spec_of_task = self.simulation.spec
         # Pictures per second of a film that shows every step.
         fps = int(control_hz) if control_hz == int(control_hz) else control_hz
         self.metadata = {**self.metadata, 'render_fps': fps}
+        self.observation_space: spaces.Space[Any] = observation_space(self.spec_of_task)
+        self.action_space: spaces.Space[Any] = action_space(self.spec_of_task)
         self.render_mode = render_mode
         self.width, self.height = width, height
         self._pictures = Pictures(self.simulation, width, height, default_camera_config)

@@ -14,12 +14,7 @@ from numpy.typing import NDArray
 
 from fetch_hand_sim.episodes.runner import has_ended
 from fetch_hand_sim.gym_envs.pictures import RENDER_MODES
-from fetch_hand_sim.gym_envs.task_attributes import (
-    TaskAttributes,
-    action_space,
-    clip_actions,
-    observation_space,
-)
+from fetch_hand_sim.gym_envs.task_attributes import TaskAttributes, clip_actions
 from fetch_hand_sim.simulation import Observation, StepResult
 from fetch_hand_sim.simulation.arguments import finite_numbers, require_whole
 from msgs_spec.arrays import Array, Flags
@@ -86,8 +81,8 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
         super().__init__(task, num_envs=num_envs, num_threads=num_threads, **arguments)
         self.metadata['autoreset_mode'] = self.autoreset_mode
         self.num_envs = num_envs
-        self.single_observation_space = observation_space(self.spec_of_task)
-        self.single_action_space = action_space(self.spec_of_task)
+        self.single_observation_space = self.observation_space
+        self.single_action_space = self.action_space
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._episode_steps = max_episode_steps or self.spec_of_task.episode_ticks

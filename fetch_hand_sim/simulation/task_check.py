@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from itertools import product
 from typing import Any
 
-import mujoco
 import numpy as np
 
 from fetch_hand_sim.simulation.models import load_model
@@ -12,7 +13,7 @@ from fetch_hand_sim.simulation.rewards import GoalMetric
 from fetch_hand_sim.simulation.simulation import Simulation
 from fetch_hand_sim.simulation.tasks import Task
 from msgs_spec.arrays import Array
-from msgs_spec.observations import Readings, observed_topics
+from msgs_spec.observations import observed_topics
 from msgs_spec.tasks import REWARD_TYPES, SUCCESS_RULES, GoalKind, TaskSpec, task_spec
 from msgs_spec.topics import sensor_topics
 
@@ -20,6 +21,8 @@ _TOLERANCE = 1e-9
 # Offset between two rows of readings, so that formulas cannot mix them up unnoticed.
 _OFFSET = 1e-6
 _STEPS = 3
+# Whether a rule is met, and the problem if it is not. Later rules rely on earlier ones.
+Rules = Iterator[tuple[Any, str]]
 
 
 def check_task(name: str) -> None:
@@ -31,206 +34,144 @@ def check_task(name: str) -> None:
         ValueError: If the task is invalid; the message names the first problem and its remedy.
             Exceptions of the task's own code are passed on.
     """
-    spec = task_spec(name)
-    _check_specification(spec)
-    simulation = Simulation(name, num_envs=2, num_threads=1)
-    task = simulation.task
-    _check_object(task)
-    _check_model_file(task)
-    _check_metrics(task)
-    _check_sensors(task)
+    for is_met, problem in _rules(task_spec(name)):
+        if not is_met:
+            raise ValueError(f'{name}: {problem}')
+
+
+def _rules(spec: TaskSpec) -> Rules:
+    yield from _specification(spec)
+    simulation = Simulation(spec.name, num_envs=2, num_threads=1)
+    yield from _model(simulation.task)
+    for rule, reward_type in product(SUCCESS_RULES, REWARD_TYPES):
+        metric: Any = simulation.task.goal_metric(rule, reward_type)
+        is_asked = isinstance(metric, GoalMetric) and (
+            (metric.success_rule, metric.reward_type) == (rule, reward_type)
+        )
+        yield is_asked, f'goal_metric({rule!r}, {reward_type!r}) must return a GoalMetric of these'
+    yield from _sensors(simulation.task)
     simulation.reset(seed=0)
-    _check_goals(spec, simulation.goals)
-    _check_formulas(task)
-    _check_rewards(simulation)
-    _check_resets(simulation)
+    yield from _array('goals of reset', simulation.goals, (2, spec.goal.size))
+    if spec.goal is GoalKind.POSE:
+        lengths = np.linalg.norm(simulation.goals[:, 3:], axis=1)
+        yield np.allclose(lengths, 1.0), f'goal quaternions have lengths {lengths}, not 1'
+    yield from _formulas(simulation.task)
+    yield from _rewards(simulation)
+    yield from _resets(simulation)
 
 
-def _check_specification(spec: TaskSpec) -> None:
-    _require(
-        spec.distance_threshold > 0.0, spec, f'distance_threshold {spec.distance_threshold}; > 0'
-    )
-    _require(spec.episode_ticks >= 1, spec, f'episode_ticks {spec.episode_ticks}; allowed: >= 1')
+def _specification(spec: TaskSpec) -> Rules:
+    yield spec.distance_threshold > 0.0, f'distance_threshold {spec.distance_threshold}; > 0'
+    yield spec.episode_ticks >= 1, f'episode_ticks {spec.episode_ticks}; allowed: >= 1'
     sizes = [part.size for part in spec.observation if part.name == spec.achieved_goal]
-    _require(
+    yield (
         sizes == [spec.goal.size],
-        spec,
         f'achieved_goal {spec.achieved_goal!r} must name one part of the observation with '
         f'{spec.goal.size} values',
     )
-    _require(
-        len(spec.robot.joints) == len(spec.robot.joint_units),
-        spec,
-        f'{len(spec.robot.joints)} joints have {len(spec.robot.joint_units)} units',
-    )
+    joints, units = len(spec.robot.joints), len(spec.robot.joint_units)
+    yield joints == units, f'{joints} joints have {units} units'
     for part in spec.robot.command:
         is_range = np.isfinite([part.lower, part.upper]).all() and part.lower < part.upper
-        _require(is_range, spec, f'command {part.name} has limits {part.lower} ... {part.upper}')
+        yield is_range, f'command {part.name} has limits {part.lower} ... {part.upper}'
     published = [topic.name for topic in sensor_topics(spec)]
     for topic in observed_topics(spec):
-        _require(
-            topic in published,
-            spec,
-            f'formulas read topic {topic!r}; allowed: {", ".join(published)}',
-        )
+        yield topic in published, f'formulas read topic {topic!r}; allowed: {", ".join(published)}'
 
 
-def _check_object(task: Task) -> None:
-    """Viewers draw the object at its free joint."""
-    if task.spec.object_name is None:
-        return
-    joint = f'{task.spec.object_name}:joint'
-    number = mujoco.mj_name2id(task.model, mujoco.mjtObj.mjOBJ_JOINT.value, joint)
-    is_free = number >= 0 and task.model.jnt_type[number] == mujoco.mjtJoint.mjJNT_FREE.value
-    _require(is_free, task.spec, f'the model needs a free joint {joint!r} for the object')
-
-
-def _check_model_file(task: Task) -> None:
-    """Pictures, films and /tf show the file, so it must contain what is simulated."""
-    simulated, drawn = (_shapes(model) for model in (task.model, load_model(task.asset)))
-    _require(
+def _model(task: Task) -> Rules:
+    """Pictures, films and /tf show the object at its free joint, and the file of the model."""
+    name = task.spec.object_name
+    yield (
+        name is None or task.object_qpos is not None,
+        f"the model needs a free joint '{name}:joint' for the object",
+    )
+    simulated, drawn = (
+        np.column_stack([model.geom_bodyid, model.geom_type, model.geom_pos, model.geom_size])
+        for model in (task.model, load_model(task.asset))
+    )
+    yield (
         simulated.shape == drawn.shape and np.allclose(simulated, drawn),
-        task.spec,
         f'the simulated model differs from {task.asset}, which pictures show; change the file',
     )
 
 
-def _shapes(model: mujoco.MjModel) -> Array:
-    """Return body, type, position and size of every geom, (geoms, 8)."""
-    columns = model.geom_bodyid[:, None], model.geom_type[:, None], model.geom_pos, model.geom_size
-    return np.concatenate(columns, axis=1)
-
-
-def _check_metrics(task: Task) -> None:
-    for rule in SUCCESS_RULES:
-        for reward_type in REWARD_TYPES:
-            metric: Any = task.goal_metric(rule, reward_type)
-            is_asked = isinstance(metric, GoalMetric) and (
-                (metric.success_rule, metric.reward_type) == (rule, reward_type)
-            )
-            _require(
-                is_asked,
-                task.spec,
-                f'goal_metric({rule!r}, {reward_type!r}) must return a GoalMetric of these',
-            )
-
-
-def _check_sensors(task: Task) -> None:
+def _sensors(task: Task) -> Rules:
     for topic in sensor_topics(task.spec):
-        _require(
-            topic.name in task.sensors,
-            task.spec,
-            f'sensor {topic.name} is missing; add it with add_sensor(name, function)',
+        name = topic.name
+        yield (
+            name in task.sensors,
+            f'sensor {name} is missing; add it with add_sensor(name, function)',
         )
-        first, second = (task.readings([topic.name])[topic.name] for _ in range(2))
-        _require_array(task.spec, f'sensor {topic.name}', first, (task.batch.nsim, topic.size))
-        _require(
-            not np.shares_memory(first, second),
-            task.spec,
-            f'sensor {topic.name} must return a fresh array (.copy())',
-        )
+        first, second = (task.readings([name])[name] for _ in range(2))
+        yield from _array(f'sensor {name}', first, (task.batch.nsim, topic.size))
+        is_fresh = not np.shares_memory(first, second)
+        yield is_fresh, f'sensor {name} must return a fresh array (.copy())'
 
 
-def _check_goals(spec: TaskSpec, goals: Array) -> None:
-    _require_array(spec, 'goals of reset', goals, (2, spec.goal.size))
-    if spec.goal is GoalKind.POSE:
-        lengths = np.linalg.norm(goals[:, 3:], axis=1)
-        _require(np.allclose(lengths, 1.0), spec, f'goal quaternions have lengths {lengths}, not 1')
-
-
-def _check_formulas(task: Task) -> None:
+def _formulas(task: Task) -> Rules:
     """Formulas must work on any leading axes, row by row."""
-    pair = _different_rows(task)
-    together = _evaluate_formulas(task, pair, (2,))
-    for row in range(2):
-        alone = _evaluate_formulas(task, {name: each[row] for name, each in pair.items()}, ())
-        for both, one in zip(together, alone, strict=True):
-            _require(
-                np.allclose(both[row], one, _TOLERANCE, _TOLERANCE),
-                task.spec,
-                'formulas must work row by row on the last axis; one row depends on another',
-            )
-    start, spec = task.spec.achieved_goal_start, task.spec
-    observation, achieved = together
-    _require(
-        np.allclose(observation[:, start : start + spec.goal.size], achieved),
-        spec,
+    spec = task.spec
+    rows = task.readings(observed_topics(spec))
+    for topic in sensor_topics(spec):
+        if topic.name in rows:
+            offsets = [_OFFSET * ('quaternion' not in part.unit) for part in topic.layout]
+            rows[topic.name][1] += np.repeat(offsets, [part.size for part in topic.layout])
+    found = []
+    for row in (slice(None), 0, 1):
+        vectors = task.observe_from({name: values[row] for name, values in rows.items()})
+        leading = (2,) if isinstance(row, slice) else ()
+        where = f'for readings with leading axes {leading}'
+        yield from _array(f'observation {where}', vectors[0], (*leading, spec.observation_size))
+        yield from _array(f'achieved_goal {where}', vectors[1], (*leading, spec.goal.size))
+        found.append(vectors)
+    together, *single = found
+    for both, *alone in zip(together, *single, strict=True):
+        yield (
+            np.allclose(both, alone, _TOLERANCE, _TOLERANCE),
+            'formulas must work row by row on the last axis; one row depends on another',
+        )
+    part = slice(spec.achieved_goal_start, spec.achieved_goal_start + spec.goal.size)
+    yield (
+        np.allclose(together[0][:, part], together[1]),
         f'observation part {spec.achieved_goal!r} is not the achieved goal; order the parts as '
         'the vector',
     )
 
 
-def _different_rows(task: Task) -> Readings:
-    rows = task.readings(observed_topics(task.spec))
-    for topic in sensor_topics(task.spec):
-        if topic.name in rows:
-            offsets = [_OFFSET * ('quaternion' not in part.unit) for part in topic.layout]
-            rows[topic.name][1] += np.repeat(offsets, [part.size for part in topic.layout])
-    return rows
-
-
-def _evaluate_formulas(
-    task: Task, readings: Readings, leading: tuple[int, ...]
-) -> tuple[Array, Array]:
-    observation, achieved = task.observe_from(readings)
-    where = f'for readings with leading axes {leading}'
-    size, goal_size = task.spec.observation_size, task.spec.goal.size
-    _require_array(task.spec, f'observation {where}', observation, (*leading, size))
-    _require_array(task.spec, f'achieved_goal {where}', achieved, (*leading, goal_size))
-    return observation, achieved
-
-
-def _check_rewards(simulation: Simulation) -> None:
+def _rewards(simulation: Simulation) -> Rules:
     achieved, desired = simulation.observe()['achieved_goal'], simulation.goals
     for goals in ((achieved, desired), (achieved[0], desired[0]), (achieved[None], desired[None])):
-        shape = goals[0].shape[:-1]
-        for name, values in (
-            ('reward', simulation.metric.reward(*goals)),
-            ('success', simulation.metric.success(*goals)),
-        ):
-            _require_array(
-                simulation.spec, f'{name} of goals {goals[0].shape}', np.asarray(values), shape
-            )
+        for name in ('reward', 'success'):
+            values = np.asarray(getattr(simulation.metric, name)(*goals))
+            yield from _array(f'{name} of goals {goals[0].shape}', values, goals[0].shape[:-1])
 
 
-def _check_resets(simulation: Simulation) -> None:
+def _resets(simulation: Simulation) -> Rules:
     """The same seed must give the same episode, and a reset must leave other simulations alone."""
+    size = simulation.spec.robot.action_size
     simulation.reset(seed=[0, 1])
     first = _all_sensors(simulation)
-    _require_array(
-        simulation.spec,
-        'resting_commands()',
-        simulation.resting_commands(),
-        (2, simulation.spec.robot.action_size),
-    )
+    yield from _array('resting_commands()', simulation.resting_commands(), (2, size))
     for _ in range(_STEPS):
-        simulation.step(np.full((2, simulation.spec.robot.action_size), 0.5))
+        simulation.step(np.full((2, size), 0.5))
     before = _all_sensors(simulation)
     simulation.reset(seed=0, ids=[0])
     again = _all_sensors(simulation)
-    _require(
+    yield (
         np.allclose(again[0], first[0], _TOLERANCE, _TOLERANCE),
-        simulation.spec,
         'a reset with the same seed gives other sensor values; reset must set the whole state and '
         'call self.batch.forward(ids)',
     )
-    _require(
-        np.array_equal(again[1], before[1]),
-        simulation.spec,
-        'reset(ids) changes simulations that are not in ids',
-    )
+    is_kept = np.array_equal(again[1], before[1])
+    yield is_kept, 'reset(ids) changes simulations that are not in ids'
 
 
 def _all_sensors(simulation: Simulation) -> Array:
     return np.concatenate(list(simulation.readings().values()), axis=1)
 
 
-def _require_array(spec: TaskSpec, what: str, values: Any, shape: tuple[int, ...]) -> None:
-    _require(isinstance(values, np.ndarray), spec, f'{what} must be an array, not {values!r:.60}')
-    _require(values.shape == shape, spec, f'{what} has shape {values.shape}, not {shape}')
-    _require(bool(np.isfinite(values).all()), spec, f'{what} is not finite')
-
-
-def _require(is_met: Any, spec: TaskSpec, problem: str) -> None:
-    if not is_met:
-        raise ValueError(f'{spec.name}: {problem}')
+def _array(what: str, values: Any, shape: tuple[int, ...]) -> Rules:
+    yield isinstance(values, np.ndarray), f'{what} must be an array, not {values!r:.60}'
+    yield values.shape == shape, f'{what} has shape {values.shape}, not {shape}'
+    yield np.isfinite(values).all(), f'{what} is not finite'

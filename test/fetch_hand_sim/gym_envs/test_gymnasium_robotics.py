@@ -179,7 +179,7 @@ def test_goals_of_the_same_object_can_be_asked_for(make):
     assert env.spec_of_task.name == 'HandManipulateBlockRotateZ'
     with pytest.raises(ValueError, match='allowed: ignore and xyz, random and xyz'):
         make('HandManipulateEgg-v1', target_rotation='parallel')
-    with pytest.raises(ValueError, match="'FetchReach' has no object in the hand; allowed: Hand"):
+    with pytest.raises(ValueError, match="task 'FetchReach'; allowed: Hand"):
         ManipulateEnv('FetchReach')
 
 
