@@ -150,8 +150,8 @@ class Health:
         inference = responder.inference.milliseconds()
         values = {
             'robots': str(robots),
-            'commander': responder.commander.description,
-            'checkpoint sha256': responder.commander.sha256,
+            'commander': responder.policy.description,
+            'checkpoint sha256': responder.policy.sha256,
             'commands': str(responder.answered),
             RATE: f'{rate:.2f}',
             **{f'inference {name} (ms)': value for name, value in inference.items()},
@@ -160,7 +160,7 @@ class Health:
             'failures of the policy': str(responder.failed),
             'observation age (s)': '-' if age is None else f'{age:.3f}',
         }
-        task = responder.commander.spec.name
+        task = responder.policy.task
         pace = 'the robot is paused' if given.is_paused else f'{rate:.1f} commands per second'
         report = Report(self._name, task, values, f'{task}: {pace}')
         dropped = self._dropped.since(responder.join.dropped)

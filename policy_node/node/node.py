@@ -27,7 +27,7 @@ from node_runtime.ros import rclpy_profile, ros_message_class, seldom
 from node_runtime.ros_parameters import declare_parameters, set_callback
 from policy_node.node import NODE_NAME
 from policy_node.node.health import Health, Pace, read_pace
-from policy_node.node.responder import Commander, Responder
+from policy_node.node.responder import Responder
 from policy_node.policies.loading import TaskMissing, load_policy
 from policy_node.policies.policy import LoadedPolicy
 
@@ -124,9 +124,8 @@ class PolicyNode(Node):
     def _start(self, status: EpisodeStatus, loop: EventLoop, stop: StopSignals) -> None:
         """Begin to answer the robot that was found."""
         try:
-            self._loaded = self._load_for(status)
-            commander = Commander(self._loaded, status.control_hz)
-            responder = Responder(commander, status, self._send)
+            policy = self._loaded = self._load_for(status)
+            responder = Responder(policy, status, self._send)
         except ValueError as error:
             raise NodeFailure(str(error)) from None
         self._responder, self._answered_status = responder, status
@@ -141,12 +140,12 @@ class PolicyNode(Node):
             if stop or self._has_robot_changed() or self._is_replaced:
                 return
             self._report_when_due(missing if time.monotonic() > began + _PATIENCE else ())
-        self._announce(commander)
+        self._announce(policy)
         # Created last: for the robot, this publisher means that the policy is ready.
-        self._commands = self._publisher(topic(commander.spec, 'commands'))
+        self._commands = self._publisher(topic(task_spec(policy.task), 'commands'))
         self._of_robot.append(self._commands)
         self._health.start(responder, status, time.monotonic())
-        self.get_logger().info(f'{commander.spec.name}: commands come from {commander.description}')
+        self.get_logger().info(f'{policy.task}: commands come from {policy.description}')
 
     def _unpublished(self, subscriptions: list[Subscription]) -> list[str]:
         """Return the topics without a publisher, by their (possibly remapped) names."""
@@ -201,7 +200,7 @@ class PolicyNode(Node):
             try:
                 loaded = load_policy(name, task, trust=self._settings['trust'])
                 if status is not None:
-                    Commander(loaded, status.control_hz)
+                    loaded.require_rate(status.control_hz)
             except TaskMissing:
                 return None, status
             except ValueError as error:
@@ -229,10 +228,10 @@ class PolicyNode(Node):
         self._commands = self._responder = self._answered_status = None
         self._health.stop()
 
-    def _announce(self, commander: Commander) -> None:
+    def _announce(self, policy: LoadedPolicy) -> None:
         """Publish the name of the policy for the robot's log, with its last stamp."""
-        status = topic(commander.spec, 'policy_status')
-        values = {'commander': commander.description, 'checkpoint_sha256': commander.sha256}
+        status = topic(task_spec(policy.task), 'policy_status')
+        values = {'commander': policy.description, 'checkpoint_sha256': policy.sha256}
         message = build_status(status, self._status_stamp, NODE_NAME, values)
         publisher = self._publisher(status)
         self._of_robot.append(publisher)
@@ -325,7 +324,7 @@ class PolicyNode(Node):
         if any(status.is_of_same_robot(each) for each in self._refused):
             return False
         try:
-            Commander(self._load_for(status), status.control_hz)
+            self._load_for(status).require_rate(status.control_hz)
         except ValueError as error:
             self._refused = [*self._refused[-_REMEMBERED:], status]
             self.get_logger().warning(str(error))

@@ -97,52 +97,6 @@ class StampJoin:
             del self._pending[other]
 
 
-Observation = dict[str, NDArray[np.float64]]
-
-
-class Commander:
-    """Turn observations into commands for one robot.
-
-    Args:
-        loaded: The policy.
-        control_hz: Action frequency of the robot, Hz.
-
-    Attributes:
-        spec: Specification of the task.
-        description: Format and file name of the policy.
-        sha256: SHA-256 of its file; empty without a file.
-
-    Raises:
-        ValueError: If the policy was trained at another frequency.
-    """
-
-    def __init__(self, loaded: LoadedPolicy, control_hz: float) -> None:
-        if loaded.control_hz not in (None, control_hz):
-            raise ValueError(
-                f'{loaded.description} was trained at {loaded.control_hz:g} Hz; the robot runs at '
-                f'{control_hz:g} Hz'
-            )
-        self.spec = task_spec(loaded.task)
-        self.description = loaded.description
-        self.sha256 = loaded.sha256
-        self._loaded = loaded
-        self._state: Any = None
-
-    def start_episode(self) -> None:
-        """Reset the memory of the policy."""
-        self._state = None
-
-    def command(self, observation: Observation) -> NDArray[np.float64]:
-        """Return the command (action size,), in command units, for one observation.
-
-        Raises:
-            PolicyError: If the policy fails or returns an invalid action.
-        """
-        action, self._state = self._loaded.predict(observation, self._state)
-        command = command_from_action(self.spec.robot, action.astype(np.float64))
-        return np.asarray(command, dtype=np.float64)
-
-
 # Seconds until the policy tries a failed tick again.
 _ASK_AGAIN = 1.0
 
@@ -154,13 +108,13 @@ class Responder:
     robot is faster than the policy, ticks are skipped; the delay does not grow.
 
     Args:
-        commander: The policy.
+        policy: The policy.
         status: The robot's last `episode_status`.
         send: Publishes the CDR bytes of a command; returns False without a subscriber.
         clock: A steady clock, seconds.
 
     Attributes:
-        commander: The policy of the robot.
+        policy: The policy of the robot.
         topics: The topics it needs.
         join: Joins them by stamp.
         answered: Commands sent.
@@ -172,17 +126,24 @@ class Responder:
         inference: Wall-clock time from a complete observation to its command.
         received_at: Time of the last complete observation, seconds of the clock.
         interval: Seconds between the last two complete observations; infinite before.
+
+    Raises:
+        ValueError: If the policy was trained at another frequency.
     """
 
     def __init__(
         self,
-        commander: Commander,
+        policy: LoadedPolicy,
         status: EpisodeStatus,
         send: Callable[[bytes], bool],
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self.commander = commander
+        policy.require_rate(status.control_hz)
+        self.policy = policy
+        # Memory of the policy.
+        self._state: Any = None
         spec = task_spec(status.task, status.joint_prefix)
+        self._robot = spec.robot
         self._assembler = ObservationAssembler(spec, status.control_hz)
         self._send = send
         self._clock = clock
@@ -193,9 +154,9 @@ class Responder:
         }
         self._due: Vectors | None = None
         self._due_stamp = 0
-        self._asked: dict[str, NDArray[np.float64]] | None = None
+        self._asked: Vectors | None = None
         # The last answered tick, whether it began an episode, and stamps of episode ends.
-        self._answered: tuple[int, dict[str, NDArray[np.float64]]] | None = None
+        self._answered: tuple[int, Vectors] | None = None
         self._is_first = True
         self._starts_at = self._ends_at = -1
         self._ask_again_at = 0.0
@@ -237,9 +198,9 @@ class Responder:
             self._starts_at = stamp
             # Topics are not ordered: the first tick may have been answered before its status came.
             if self._answered is not None and self._answered[0] == stamp and not self._is_first:
-                self.commander.start_episode()
+                self._state = None
                 with contextlib.suppress(ValueError):
-                    self.commander.command(self._answered[1])
+                    self._command(self._answered[1])
 
     @property
     def is_due(self) -> bool:
@@ -282,9 +243,9 @@ class Responder:
         before, now = self._answered[0] if self._answered else -1, self._due_stamp
         self._is_first = before < self._starts_at <= now or before <= self._ends_at < now
         if self._is_first or self._answered is None:
-            self.commander.start_episode()
+            self._state = None
 
-    def _observed(self, vectors: Vectors) -> dict[str, NDArray[np.float64]]:
+    def _observed(self, vectors: Vectors) -> Vectors:
         try:
             return self._assembler.assemble(vectors)
         except Exception as error:
@@ -298,10 +259,16 @@ class Responder:
             self.interval = now - self.received_at
         self.received_at = now
 
-    def _answer(self, observation: dict[str, NDArray[np.float64]]) -> None:
+    def _command(self, observation: Vectors) -> NDArray[np.float64]:
+        """Return the command (action size,), in command units."""
+        action, self._state = self.policy.predict(observation, self._state)
+        command = command_from_action(self._robot, action.astype(np.float64))
+        return np.asarray(command, dtype=np.float64)
+
+    def _answer(self, observation: Vectors) -> None:
         began = self._clock()
         try:
-            command = self.commander.command(observation)
+            command = self._command(observation)
         except ValueError as error:
             self.failed += 1
             self.last_failure = str(error)

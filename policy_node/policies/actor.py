@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from policy_node.policies.network_shape import INPUT_CLIP, NORMALIZED_CLIP, NetworkShape
-from policy_node.policies.policy import observation_and_goal, past_after, past_before
+from policy_node.policies.network_shape import (
+    INPUT_CLIP,
+    NORMALIZED_CLIP,
+    NetworkPolicy,
+    NetworkShape,
+)
 
 
 class MLP(nn.Module):
@@ -69,7 +72,7 @@ class Normalizer(nn.Module):
         return ((clipped - self.mean) / self.std).clamp(-NORMALIZED_CLIP, NORMALIZED_CLIP)
 
 
-class Actor(nn.Module):
+class Actor(nn.Module, NetworkPolicy):
     """Deterministic policy: a multilayer perceptron with tanh output on normalised inputs."""
 
     def __init__(self, shape: NetworkShape) -> None:
@@ -94,53 +97,19 @@ class Actor(nn.Module):
             goal: Desired goal, (..., goal_size).
         """
         normalized = self.observation_normalizer(observation), self.goal_normalizer(goal)
-        if self.shape.goal_features is None:
-            return torch.cat(normalized, dim=-1)
-        size = self.shape.observation_size
-        seen = normalized[0][..., :size], normalized[1]
-        inputs: Tensor = self.shape.goal_features.inputs((observation[..., :size], goal), seen)
-        if not self.shape.past_actions:
-            return inputs
-        return torch.cat([inputs, normalized[0][..., size:]], dim=-1)
+        inputs: Tensor = self.shape.inputs((observation, goal), normalized)
+        return inputs
 
     def forward(self, features: Tensor) -> Tensor:
         """Return actions (..., action_size) in [-1, 1] for `features`."""
         return torch.tanh(self.network(features))
 
     @torch.inference_mode()
-    def predict(
-        self,
-        observation: Mapping[str, ArrayLike],
-        state: Any = None,
-        episode_start: Any = None,
-        deterministic: bool = True,
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
-        """Return the action for one observation or a batch, as Stable-Baselines3's `predict` does.
-
-        Args:
-            observation: `observation` (..., observation_size) and `desired_goal` (..., goal_size)
-                in the units of the task. One of the two may serve a whole batch. Other keys are
-                ignored.
-            state: State that the last call returned; None at the start of an episode. Only an
-                actor with past actions uses it.
-            episode_start: Booleans (...,), True where an episode starts.
-            deterministic: Ignored, because the policy has no noise.
-
-        Returns:
-            Actions (..., action_size) in [-1, 1], float32, and the state for the next call; None
-            for an actor without past actions.
-
-        Raises:
-            ValueError: If a part is missing or has a wrong shape.
-        """
-        shape = self.shape
-        parts = observation_and_goal(observation, shape.observation_size, shape.goal_size)
-        past = None
-        if shape.past_actions:
-            past = past_before(state, episode_start, parts[0].shape[:-1], shape.past_size)
-            parts = np.concatenate([parts[0], past], axis=-1), parts[1]
-        action = self(self.features(*map(self._input, parts))).cpu().numpy()
-        return action, None if past is None else past_after(past, action)
+    def act(self, seen: NDArray[np.float32], goal: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return actions (..., action_size) for inputs (..., input_size) and goals."""
+        action: Tensor = self(self.features(self._input(seen), self._input(goal)))
+        found: NDArray[np.float32] = action.cpu().numpy()
+        return found
 
     def _input(self, values: NDArray[np.float32]) -> Tensor:
         # torch would warn of read-only arrays.

@@ -68,7 +68,7 @@ class RelativeGoal:
 
     def inputs(self, seen: Seen, normalized: Seen) -> Array:
         """Return the inputs (..., size): normalised observation and goal, then the difference."""
-        return _concatenate(*normalized, self.difference(*seen))
+        return concatenate(*normalized, self.difference(*seen))
 
     def goal_position(self, observation_size: int, goal_size: int) -> list[int]:
         """Return the indices of the inputs that depend on the position of a pose goal."""
@@ -82,13 +82,13 @@ class RelativeGoal:
         if self.goal is not GoalKind.POSE:
             difference = goal - achieved
             near = (scale * difference).clip(-_CLIP, _CLIP)
-            return _concatenate(difference, near) if self.goal is GoalKind.POINT else near
+            return concatenate(difference, near) if self.goal is GoalKind.POINT else near
         difference = goal[..., :3] - achieved[..., :3]
         position = (scale * difference).clip(-_CLIP, _CLIP) * float(self.position_counts)
         rotation = _axis_turn if self.ignores_z_rotation else _relative_quaternion
         scalar, vector = rotation(achieved[..., 3:], goal[..., 3:])
         near = (_ROTATION_SCALE * vector).clip(-_CLIP, _CLIP)
-        return _concatenate(scalar, vector, near, position)
+        return concatenate(scalar, vector, near, position)
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +121,7 @@ class SymmetricObject:
         rotation = _rotation_matrix(observation[..., start + 3 : start + 7])
         angular_velocity = (rotation @ observation[..., start - 3 : start, None]).squeeze(-1)
         shape = _cube_shape(rotation) if self.symmetry == 'cube' else _axis_shape(rotation)
-        return _concatenate(
+        return concatenate(
             normalized_observation[..., : start - 3],
             normalized_observation[..., start : start + 3],
             (_ANGULAR_VELOCITY_SCALE * angular_velocity).clip(-_CLIP, _CLIP),
@@ -227,7 +227,7 @@ def _library(array: Array) -> ModuleType:
     return torch
 
 
-def _concatenate(*parts: Array) -> Array:
+def concatenate(*parts: Array) -> Array:
     """Concatenate along the last axis."""
     return _library(parts[0]).concatenate(parts, -1)
 

@@ -1,10 +1,20 @@
-"""The shape of an actor's network: sizes, inputs and names of its tensors."""
+"""The shape of an actor's network, and the `predict` of all that have one."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
-from policy_node.policies.goal_features import GoalFeatures
+import numpy as np
+from numpy.typing import NDArray
+
+from policy_node.policies.goal_features import Array, GoalFeatures, Seen, concatenate
+from policy_node.policies.policy import (
+    Observation,
+    observation_and_goal,
+    past_after,
+    past_before,
+)
 
 # Plappert et al. 2018, appendix B.
 INPUT_CLIP = 200.0
@@ -58,6 +68,19 @@ class NetworkShape:
         size = self.goal_features.size(self.observation_size, self.goal_size)
         return size + self.past_size
 
+    def inputs(self, given: Seen, normalized: Seen) -> Array:
+        """Return the network inputs (..., feature_size), NumPy or torch.
+
+        Args:
+            given: Observation with past actions (..., input_size), and goal (..., goal_size).
+            normalized: The same, normalised.
+        """
+        if self.goal_features is None:
+            return concatenate(*normalized)
+        (state, goal), (seen, wanted), size = given, normalized, self.observation_size
+        inputs = self.goal_features.inputs((state[..., :size], goal), (seen[..., :size], wanted))
+        return concatenate(inputs, seen[..., size:]) if self.past_actions else inputs
+
     @property
     def layer_names(self) -> list[str]:
         """Names of the hidden layers in `Actor`; the LayerNorm of layer i is `norm_names[i]`."""
@@ -84,3 +107,46 @@ class NetworkShape:
         for name, width in zip(self.norm_names, self.hidden_sizes, strict=False):
             shapes[f'{name}.weight'] = shapes[f'{name}.bias'] = (width,)
         return shapes
+
+
+class NetworkPolicy:
+    """A deterministic policy of a network; subclasses compute the action."""
+
+    shape: NetworkShape
+
+    def act(self, seen: NDArray[np.float32], goal: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return actions (..., action_size) for inputs (..., input_size) and goals."""
+        raise NotImplementedError
+
+    def predict(
+        self,
+        observation: Observation,
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = True,
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
+        """Return the action for one observation or a batch, as Stable-Baselines3's `predict` does.
+
+        Args:
+            observation: `observation` (..., observation_size) and `desired_goal` (..., goal_size)
+                in the units of the task. One of the two may serve a whole batch. Other keys are
+                ignored.
+            state: State that the last call returned; None at the start of an episode. Only an
+                actor with past actions uses it.
+            episode_start: Booleans (...,), True where an episode starts.
+            deterministic: Ignored, because the policy has no noise.
+
+        Returns:
+            Actions (..., action_size) in [-1, 1], float32, and the state for the next call; None
+            for an actor without past actions.
+
+        Raises:
+            ValueError: If a part is missing or has a wrong shape.
+        """
+        shape = self.shape
+        seen, goal = observation_and_goal(observation, shape.observation_size, shape.goal_size)
+        if not shape.past_actions:
+            return self.act(seen, goal), None
+        past = past_before(state, episode_start, seen.shape[:-1], shape.past_size)
+        action = self.act(np.concatenate([seen, past], axis=-1), goal)
+        return action, past_after(past, action)

@@ -14,7 +14,6 @@ from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
 from threading import Lock
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,14 +21,13 @@ from threadpoolctl import ThreadpoolController
 
 from msgs_spec.arrays import Array
 from policy_node.policies import checkpoint
-from policy_node.policies.network_shape import INPUT_CLIP, NORMALIZED_CLIP, NetworkShape
-from policy_node.policies.policy import (
-    LoadedPolicy,
-    Observation,
-    observation_and_goal,
-    past_after,
-    past_before,
+from policy_node.policies.network_shape import (
+    INPUT_CLIP,
+    NORMALIZED_CLIP,
+    NetworkPolicy,
+    NetworkShape,
 )
+from policy_node.policies.policy import LoadedPolicy
 
 # The default of torch.nn.LayerNorm.
 _NORM_EPSILON = 1e-5
@@ -37,7 +35,7 @@ _NORM_EPSILON = 1e-5
 _ONE_AT_A_TIME = Lock()
 
 
-class NumpyActor:
+class NumpyActor(NetworkPolicy):
     """Deterministic policy: a multilayer perceptron with tanh output on normalised inputs.
 
     Args:
@@ -48,30 +46,17 @@ class NumpyActor:
         self.shape = shape
         self._values = {name: values.astype(np.float64) for name, values in tensors.items()}
 
-    def predict(
-        self,
-        observation: Observation,
-        state: Any = None,
-        episode_start: Any = None,
-        deterministic: bool = True,
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
-        """Return actions (..., action_size), float32, and the state, as `Actor.predict` does.
-
-        Raises:
-            ValueError: If a part is missing or has a wrong shape.
-        """
-        del deterministic
-        shape = self.shape
+    def act(self, seen: NDArray[np.float32], goal: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return actions (..., action_size) for inputs (..., input_size) and goals."""
         # Rounded to float32 first, as in training.
-        seen, goal = observation_and_goal(observation, shape.observation_size, shape.goal_size)
-        past = None
-        if shape.past_actions:
-            past = past_before(state, episode_start, seen.shape[:-1], shape.past_size)
-            seen = np.concatenate([seen, past], axis=-1)
-        features = self._features(seen.astype(np.float64), goal.astype(np.float64))
+        given = seen.astype(np.float64), goal.astype(np.float64)
+        normalized = (
+            self._normalize('observation_normalizer', given[0]),
+            self._normalize('goal_normalizer', given[1]),
+        )
+        features = self.shape.inputs(given, normalized)
         with _ONE_AT_A_TIME, _blas().limit(limits=1):
-            action = np.tanh(self._forward(features)).astype(np.float32)
-        return action, None if past is None else past_after(past, action)
+            return np.tanh(self._forward(features)).astype(np.float32)
 
     def _forward(self, layer: Array) -> Array:
         shape = self.shape
@@ -81,18 +66,6 @@ class NumpyActor:
                 layer = self._norm(shape.norm_names[index], layer)
             layer = np.maximum(layer, 0.0)
         return self._linear('network.output', layer)
-
-    def _features(self, state: Array, goal: Array) -> Array:
-        normalized = (
-            self._normalize('observation_normalizer', state),
-            self._normalize('goal_normalizer', goal),
-        )
-        if self.shape.goal_features is None:
-            return np.concatenate(normalized, axis=-1)
-        size = self.shape.observation_size
-        seen = normalized[0][..., :size], normalized[1]
-        inputs = self.shape.goal_features.inputs((state[..., :size], goal), seen)
-        return np.concatenate([inputs, normalized[0][..., size:]], axis=-1)
 
     def _normalize(self, name: str, values: Array) -> Array:
         mean, std = self._values[f'{name}.mean'], self._values[f'{name}.std']

@@ -25,12 +25,8 @@ from numpy.typing import NDArray
 from msgs_spec.text import one_line
 from policy_node.policies.checkpoint import ActorInfo, loaded_actor, parse_metadata
 from policy_node.policies.files import read_file, sha256
-from policy_node.policies.policy import (
-    LoadedPolicy,
-    MemorylessPolicy,
-    Observation,
-    observation_and_goal,
-)
+from policy_node.policies.network_shape import NetworkPolicy
+from policy_node.policies.policy import LoadedPolicy
 
 INPUTS = ('observation', 'desired_goal')
 OUTPUT = 'action'
@@ -44,7 +40,7 @@ _TRIAL_CPU_SECONDS = 2
 _TRIAL_TIMEOUT = 30.0
 
 
-class OnnxActor(MemorylessPolicy):
+class OnnxActor(NetworkPolicy):
     """Run an ONNX file on one thread.
 
     Raises:
@@ -57,22 +53,20 @@ class OnnxActor(MemorylessPolicy):
         metadata = self._session.get_modelmeta().custom_metadata_map
         # Old files have version 1 and do not contain it.
         self.info: ActorInfo = parse_metadata({'format_version': '1', **metadata}, path)
+        self.shape = self.info.shape
         self._check_sizes(path)
 
-    def act(self, observation: Observation) -> NDArray[np.float32]:
-        """Return actions (..., action size) in [-1, 1] for one observation or a batch."""
-        sizes = self.info.shape.observation_size, self.info.goal_size
-        parts = dict(zip(INPUTS, observation_and_goal(observation, *sizes), strict=True))
-        leading = parts['observation'].shape[:-1]
-        flat = {name: part.reshape(-1, part.shape[-1]) for name, part in parts.items()}
-        (action,) = self._session.run([OUTPUT], flat)
-        return np.asarray(action, np.float32).reshape(*leading, -1)
+    def act(self, seen: NDArray[np.float32], goal: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return actions (..., action size) for observations and goals."""
+        flat = [part.reshape(-1, part.shape[-1]) for part in (seen, goal)]
+        (action,) = self._session.run([OUTPUT], dict(zip(INPUTS, flat, strict=True)))
+        return np.asarray(action, np.float32).reshape(*seen.shape[:-1], -1)
 
     def _check_sizes(self, path: Path) -> None:
         places = (*self._session.get_inputs(), *self._session.get_outputs())
         found = {place.name: place.shape[-1] if place.shape else None for place in places}
         wanted = {
-            'observation': self.info.shape.observation_size,
+            'observation': self.shape.observation_size,
             'desired_goal': self.info.goal_size,
             OUTPUT: self.info.action_size,
         }
@@ -153,7 +147,7 @@ def _trial(path: Path) -> int:
         resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds))
         resource.setrlimit(resource.RLIMIT_DATA, (_TRIAL_MEMORY, _TRIAL_MEMORY))
         actor = OnnxActor(data, path)
-        sizes = (actor.info.shape.observation_size, actor.info.goal_size)
+        sizes = (actor.shape.observation_size, actor.shape.goal_size)
         actor.predict({name: np.zeros(n) for name, n in zip(INPUTS, sizes, strict=True)})
     except ValueError as error:
         print(error, file=sys.stderr)

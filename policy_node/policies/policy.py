@@ -65,6 +65,18 @@ class LoadedPolicy:
     sha256: str = ''
     is_bounded: bool = False
 
+    def require_rate(self, control_hz: float) -> None:
+        """Reject a robot with another action frequency, Hz.
+
+        Raises:
+            ValueError: If the policy was trained at another frequency.
+        """
+        if self.control_hz not in (None, control_hz):
+            raise ValueError(
+                f'{self.description} was trained at {self.control_hz:g} Hz; the robot runs at '
+                f'{control_hz:g} Hz'
+            )
+
     def predict(
         self,
         observation: Observation,

@@ -23,7 +23,7 @@ from msgs_spec.codecs import decode_status, message_stamp
 from msgs_spec.schemas import deserialize
 from msgs_spec.tasks import TaskSpec, task_spec
 from msgs_spec.tick import TickEncoder
-from policy_node.node.responder import Commander, Responder
+from policy_node.node.responder import Responder
 from policy_node.policies.loading import load_policy
 from support.fresh_actor import fresh_actor
 from support.graph import (
@@ -59,8 +59,8 @@ def batch_run(
     encoder, buffer = TickEncoder(spec), CommandBuffer(spec.robot, 0.0)
     status = runner.waiting_status()
     sent: list[bytes] = []
-    commander = Commander(load_policy(policy, status.task), status.control_hz)
-    responder = Responder(commander, status, lambda data: sent.append(data) or True)
+    loaded = load_policy(policy, status.task)
+    responder = Responder(loaded, status, lambda data: sent.append(data) or True)
     result: list[dict[str, list[bytes]]] = []
     while not runner.is_done:
         tick = runner.advance(buffer.take())

@@ -125,17 +125,21 @@ class DDPG(ActorCritic):
         workers: Workers,
         parts: Parts | None = None,
     ) -> None:
-        parts = parts or Parts()
+        self.parts = parts or Parts()
         self.config = config
-        self.critic_loss = parts.critic_loss
+        self.critic_loss = self.parts.critic_loss
         actor, critic = self._make_networks(shape)
         # A batch normalization updates its statistics only in the update of the critic.
         super().__init__(actor, critic.eval(), config, device, workers)
-        self._targets = parts.targets(self.actor.network, self.critic)
+        self._targets = self.parts.targets(self.actor.network, self.critic)
         self.target_actor, self.target_critic = self._targets.actor, self._targets.critic
         self._bfloat16 = uses_bfloat16(config.precision, device)
         # Loss and value of the last update of the actor.
         self._of_actor = (torch.zeros((), device=device),) * 2
+        self._set_up(shape)
+
+    def _set_up(self, shape: NetworkShape) -> None:
+        """Make what only a subclass has."""
 
     def _make_networks(self, shape: NetworkShape) -> tuple[Actor, nn.Module]:
         return Actor(shape), self.critic_loss.make(shape.feature_size, shape)

@@ -21,9 +21,7 @@ from torch import Tensor, nn
 from msgs_spec.tasks import GoalKind, task_spec
 from policy_node.policies.actor import MLP
 from policy_node.policies.network_shape import NetworkShape
-from policy_node.training.configuration.config import TrainConfig
-from policy_node.training.learners.ddpg import DDPG, Parts, TensorBatch
-from policy_node.training.machine import Workers
+from policy_node.training.learners.ddpg import DDPG, TensorBatch
 
 # Candidate states of a subgoal, for every fourth transition of a batch. Their values are most of
 # the additional cost of an update.
@@ -40,20 +38,12 @@ class ImaginingDDPG(DDPG):
         imagination: Network from features of a state and a goal to a normalized subgoal.
     """
 
-    def __init__(
-        self,
-        shape: NetworkShape,
-        config: TrainConfig,
-        device: torch.device,
-        workers: Workers,
-        parts: Parts | None = None,
-    ) -> None:
-        super().__init__(shape, config, device, workers, parts)
-        self.imagination = MLP(shape.feature_size, shape.goal_size, shape).to(device)
+    def _set_up(self, shape: NetworkShape) -> None:
+        self.imagination = MLP(shape.feature_size, shape.goal_size, shape).to(self.device)
         self._imagination_parameters = list(self.imagination.parameters())
-        workers.broadcast(self._imagination_parameters)
+        self.workers.broadcast(self._imagination_parameters)
         self._imagination_optimizer = self._adam(self._imagination_parameters)
-        spec = task_spec(config.task)
+        spec = task_spec(self.config.task)
         start = spec.achieved_goal_start
         self._achieved = slice(start, start + shape.goal_size)
         self._is_pose = spec.goal is GoalKind.POSE

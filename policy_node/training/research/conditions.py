@@ -8,8 +8,8 @@ whose column is added to the bias of the first layer.
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -32,84 +32,6 @@ Goals = NDArray[np.float64]
 SMALLEST_THRESHOLD = 0.5
 
 
-@dataclass(frozen=True, slots=True)
-class Threshold:
-    """The success threshold as a multiple of that of training, drawn log-uniformly.
-
-    Coarse goals are reached often, and their value may generalize to fine ones. The widest
-    threshold should be wider than the distance at the start of an episode.
-
-    Attributes:
-        widest: Largest multiple.
-    """
-
-    metric: GoalMetric
-    widest: float
-
-    def draw(self, count: int, generator: np.random.Generator) -> NDArray[np.float64]:
-        """Draw the multiples (count,) of transitions."""
-        low, high = np.log(SMALLEST_THRESHOLD), np.log(self.widest)
-        return np.asarray(np.exp(generator.uniform(low, high, count)))
-
-    def inputs(self, drawn: NDArray[np.float64]) -> Array32:
-        """Return the inputs of the networks, (count, 1): logarithms of the multiples."""
-        return np.log(drawn).astype(np.float32)[:, None]
-
-    def reward(self, achieved: Goals, desired: Goals, drawn: NDArray[np.float64]) -> Goals:
-        """Return rewards (count,): 0 within the drawn multiple of the threshold, else -1."""
-        distance, rotation = self.metric.distances(achieved, desired)
-        spec = self.metric.spec
-        reached = distance < drawn * spec.distance_threshold
-        if spec.rotation_threshold is not None:
-            reached &= rotation < drawn * spec.rotation_threshold
-        return reached.astype(np.float64) - 1.0
-
-    def after(self, drawn: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the multiples one step later: the same."""
-        return drawn
-
-    def continues(self, drawn: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return whether later rewards count, (count,): always."""
-        return np.ones(len(drawn), np.bool_)
-
-
-@dataclass(frozen=True, slots=True)
-class Horizon:
-    """The number of steps left; values are sums of that many rewards (TDM, arXiv 1802.09081).
-
-    Attributes:
-        compute_reward: (achieved_goal, desired_goal) -> reward, batched.
-    """
-
-    ticks: int
-    compute_reward: Callable[[Goals, Goals], Goals]
-
-    def draw(self, count: int, generator: np.random.Generator) -> NDArray[np.float64]:
-        """Draw numbers of steps (count,) from 1 to the length of an episode."""
-        return generator.integers(1, self.ticks + 1, count).astype(np.float64)
-
-    def inputs(self, drawn: NDArray[np.float64]) -> Array32:
-        """Return the inputs of the networks, (count, 1): shares of an episode."""
-        return (drawn / self.ticks).astype(np.float32)[:, None]
-
-    def reward(self, achieved: Goals, desired: Goals, drawn: NDArray[np.float64]) -> Goals:
-        """Return the rewards (count,) of the task."""
-        del drawn
-        return self.compute_reward(achieved, desired)
-
-    def after(self, drawn: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the steps left one step later."""
-        return drawn - 1.0
-
-    def continues(self, drawn: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return whether a step is left after this one, (count,)."""
-        return drawn > 1.0
-
-
-Condition = Threshold | Horizon
-"""The input of values beside state, action and goal."""
-
-
 def acting_input(config: TrainConfig) -> float | None:
     """Return the input at which the actor acts; None without a condition.
 
@@ -118,52 +40,6 @@ def acting_input(config: TrainConfig) -> float | None:
     if config.condition == 'threshold':
         return 0.0
     return 1.0 if config.condition == 'horizon' else None
-
-
-def make_condition(config: TrainConfig, metric: GoalMetric) -> Condition:
-    """Return the condition of a run.
-
-    Raises:
-        ValueError: If it would replace the own reward of a third-party task.
-    """
-    if config.condition == 'horizon':
-        return Horizon(metric.spec.episode_ticks, metric.reward)
-    if metric.has_own_reward:
-        raise ValueError(
-            f'condition threshold would replace {own_reward(metric)}; allowed: none, horizon'
-        )
-    return Threshold(metric, config.widest_threshold)
-
-
-@dataclass(frozen=True, kw_only=True)
-class ConditionedSampler(TransitionSampler):
-    """Draws a value of the condition for each transition."""
-
-    condition: Condition
-
-    def transitions(
-        self,
-        starts: Starts,
-        steps: NDArray[np.int64],
-        goal: Array32,
-        generator: np.random.Generator,
-    ) -> Transitions:
-        """Return transitions with their conditions."""
-        condition = self.condition
-        drawn = condition.draw(len(starts.row), generator)
-
-        def reward_after(achieved: Array32, chosen: NDArray[np.int64]) -> NDArray[np.float64]:
-            goals = achieved.astype(np.float64), goal[chosen].astype(np.float64)
-            return condition.reward(*goals, drawn[chosen])
-
-        batch = self.several(starts, steps, goal, reward_after)
-        values = {name: getattr(batch, name) for name in Transitions.__slots__}
-        values['discount'] = batch.discount * condition.continues(drawn)
-        return ConditionedTransitions(
-            **values,
-            condition=condition.inputs(drawn),
-            next_condition=condition.inputs(condition.after(drawn)),
-        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -176,6 +52,94 @@ class ConditionedTransitions(Transitions):
 
     condition: Array32
     next_condition: Array32
+
+
+@dataclass(frozen=True, kw_only=True)
+class ThresholdSampler(TransitionSampler):
+    """Draws a success threshold for each transition, as a multiple of that of training.
+
+    Multiples are log-uniform. Coarse goals are reached often, and their value may generalize to
+    fine ones. The widest threshold should be wider than the distance at the start of an episode.
+
+    Attributes:
+        widest: Largest multiple.
+    """
+
+    metric: GoalMetric
+    widest: float
+
+    def transitions(
+        self,
+        starts: Starts,
+        steps: NDArray[np.int64],
+        goal: Array32,
+        generator: np.random.Generator,
+    ) -> ConditionedTransitions:
+        """Return transitions with logarithms of the multiples as conditions."""
+        low, high = np.log(SMALLEST_THRESHOLD), np.log(self.widest)
+        drawn = np.exp(generator.uniform(low, high, len(starts.row)))
+        spec = self.metric.spec
+
+        def reward_after(achieved: Array32, chosen: NDArray[np.int64]) -> Goals:
+            goals = achieved.astype(np.float64), goal[chosen].astype(np.float64)
+            distance, rotation = self.metric.distances(*goals)
+            reached = distance < drawn[chosen] * spec.distance_threshold
+            if spec.rotation_threshold is not None:
+                reached &= rotation < drawn[chosen] * spec.rotation_threshold
+            return reached.astype(np.float64) - 1.0
+
+        batch = self.several(starts, steps, goal, reward_after)
+        condition = np.log(drawn).astype(np.float32)[:, None]
+        return _conditioned(batch, condition, condition)
+
+
+def threshold_sampler(
+    fields: dict[str, Any], metric: GoalMetric, widest: float
+) -> TransitionSampler:
+    """Return a `ThresholdSampler`.
+
+    Raises:
+        ValueError: If it would replace the own reward of a third-party task.
+    """
+    if metric.has_own_reward:
+        raise ValueError(
+            f'condition threshold would replace {own_reward(metric)}; allowed: none, horizon'
+        )
+    return ThresholdSampler(**fields, metric=metric, widest=widest)
+
+
+@dataclass(frozen=True, kw_only=True)
+class HorizonSampler(TransitionSampler):
+    """Draws a number of steps left; values are sums of that many rewards (TDM, arXiv 1802.09081).
+
+    Attributes:
+        ticks: Length of an episode; conditions are shares of it.
+    """
+
+    ticks: int
+
+    def transitions(
+        self,
+        starts: Starts,
+        steps: NDArray[np.int64],
+        goal: Array32,
+        generator: np.random.Generator,
+    ) -> ConditionedTransitions:
+        """Return transitions; the value of the next state counts if a step is left there."""
+        left = generator.integers(1, self.ticks + 1, len(starts.row)).astype(np.float64)
+        batch = super().transitions(starts, steps, goal, generator)
+        batch = replace(batch, discount=batch.discount * (left > 1.0))
+        conditions = (
+            (each / self.ticks).astype(np.float32)[:, None] for each in (left, left - 1.0)
+        )
+        return _conditioned(batch, *conditions)
+
+
+def _conditioned(
+    batch: Transitions, condition: Array32, next_condition: Array32
+) -> ConditionedTransitions:
+    values = {name: getattr(batch, name) for name in Transitions.__slots__}
+    return ConditionedTransitions(**values, condition=condition, next_condition=next_condition)
 
 
 class ConditionedDDPG(DDPG):
@@ -194,13 +158,8 @@ class ConditionedDDPG(DDPG):
         return value
 
     def tensors(self, batch: Transitions) -> TensorBatch:
-        """As `DDPG`; the condition follows the features.
-
-        Raises:
-            TypeError: If the batch has no conditions.
-        """
-        if not isinstance(batch, ConditionedTransitions):
-            raise TypeError(f'ConditionedTransitions are needed, not {type(batch).__name__}')
+        """As `DDPG`; the condition follows the features."""
+        assert isinstance(batch, ConditionedTransitions)
         tensors = super().tensors(batch)
         features = torch.cat([tensors.features, self.tensor(batch.condition)], dim=-1)
         next_condition = self.tensor(batch.next_condition)

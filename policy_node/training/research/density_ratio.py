@@ -27,10 +27,8 @@ from torch import Tensor, nn
 from msgs_spec.arrays import Array32
 from msgs_spec.tasks import task_spec
 from policy_node.policies.network_shape import NORMALIZED_CLIP, NetworkShape
-from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.experience.replay import Transitions
-from policy_node.training.learners.ddpg import DDPG, Parts, TensorBatch
-from policy_node.training.machine import Workers
+from policy_node.training.learners.ddpg import DDPG, TensorBatch
 
 # Largest weight. Larger ones belong to goals that hindsight almost never chooses.
 MOST_WEIGHT = 10.0
@@ -108,18 +106,10 @@ def _classifier(inputs: int) -> nn.Sequential:
 class WeightedDDPG(DDPG):
     """`DDPG` with importance weights in the loss of the critic; arguments as `DDPG`."""
 
-    def __init__(
-        self,
-        shape: NetworkShape,
-        config: TrainConfig,
-        device: torch.device,
-        workers: Workers,
-        parts: Parts | None = None,
-    ) -> None:
-        super().__init__(shape, config, device, workers, parts)
+    def _set_up(self, shape: NetworkShape) -> None:
         sizes = shape.feature_size, shape.goal_size, shape.action_size
-        self._ratio = DensityRatio(*sizes).to(device)
-        self._achieved_start = task_spec(config.task).achieved_goal_start
+        self._ratio = DensityRatio(*sizes).to(self.device)
+        self._achieved_start = task_spec(self.config.task).achieved_goal_start
 
     def _update_critic(self, batch: TensorBatch) -> Tensor:
         self._weight = self._weights(batch)

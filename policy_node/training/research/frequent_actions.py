@@ -41,52 +41,24 @@ class HoldingCollector(Collector):
     The paper's own idea for very frequent actions (after Sharma et al. 2017, FiGAR). The actor
     decides rarely and learns how rarely, so exploration goes further and values cross many ticks at
     once. An action that holds for n more ticks is equally good experience in the middle of its
-    time, so each tick is stored with the ticks that are left.
-
-    Args:
-        seeds: As for `Collector`.
-        most: Ticks of the longest action.
+    time, so each tick is stored with the ticks that are left. No action holds longer than its
+    episode. Arguments as `Collector`.
     """
 
-    def __init__(
-        self, simulation: Simulation, seeds: list[int], config: TrainConfig, most: int
-    ) -> None:
+    def __init__(self, simulation: Simulation, seeds: list[int], config: TrainConfig) -> None:
         super().__init__(simulation, seeds, config, extra_actions=1)
-        self._holder = Holder(most)
+        self._most = config.longest_hold
+        self._left = np.zeros(simulation.num_envs, np.int64)
+        self._held: Array32 = np.zeros((simulation.num_envs, self._columns), np.float32)
 
     def _explore(
         self, policy: Policy, observation: Observations, past: Array32, tick: int
     ) -> Array32:
         action = super()._explore(policy, observation, past, tick)
-        return self._holder.take(action, self.simulation.spec.episode_ticks - tick)
-
-
-class Holder:
-    """Holds actions for their length, in each of several simulations.
-
-    Args:
-        most: Ticks of the longest action.
-    """
-
-    def __init__(self, most: int) -> None:
-        self._most = most
-        self._left = np.zeros(0, np.int64)
-        self._held: Array32 = np.zeros((0, 0), np.float32)
-
-    def take(self, action: Array32, ticks_left: int) -> Array32:
-        """Return the actions that hold now, with the lengths that are left.
-
-        Args:
-            action: New actions (N, action size + 1), used where no action holds any longer.
-            ticks_left: Ticks to the end of the episode, with this one; no action holds longer.
-
-        Returns:
-            (N, action size + 1), float32.
-        """
-        if len(self._left) != len(action):
-            self._left, self._held = np.zeros(len(action), np.int64), action.copy()
         free = self._left == 0
-        wanted = np.minimum(ticks_of(action[:, -1], self._most), ticks_left)
+        wanted = np.minimum(
+            ticks_of(action[:, -1], self._most), self.simulation.spec.episode_ticks - tick
+        )
         self._left = np.where(free, wanted, self._left)
         held = np.where(free[:, None], action, self._held)
         held[:, -1] = length_of(self._left, self._most)
@@ -157,13 +129,8 @@ class ParameterNoise:
         self.scale = _FIRST_SCALE
 
     def perturb(self, actor: Policy) -> PerturbedActors:
-        """Return copies of an actor, each with other weights.
-
-        Raises:
-            TypeError: If the policy is not an `Actor`.
-        """
-        if not isinstance(actor, Actor):
-            raise TypeError(f'parameter noise needs an actor, not a {type(actor).__name__}')
+        """Return copies of an actor, each with other weights."""
+        assert isinstance(actor, Actor)
         return PerturbedActors([self._copy(actor) for _ in range(_COPIES)])
 
     @torch.no_grad()

@@ -25,27 +25,20 @@ from torch import nn
 from fetch_hand_sim.simulation import Simulation
 from msgs_spec.arrays import Array32
 from msgs_spec.tasks import GoalKind, task_spec
-from policy_node.policies.actor import Actor
 from policy_node.policies.network_shape import NORMALIZED_CLIP, NetworkShape
 from policy_node.policies.policy import Policy
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.experience.collector import Collector, Observations
 from policy_node.training.experience.experience import Experience
-from policy_node.training.experience.hindsight import SOURCES, draw_sources, goals_of
+from policy_node.training.experience.hindsight import SOURCES
 from policy_node.training.experience.replay import Episodes, Starts, Transitions
 from policy_node.training.experience.sampling import TransitionSampler
 from policy_node.training.learners.actor_critic import Losses
-from policy_node.training.learners.ddpg import DDPG, Parts, TensorBatch
-from policy_node.training.machine import Workers
+from policy_node.training.learners.ddpg import DDPG, TensorBatch
 
 # Share of proposals that are tested (Levy et al. 2019).
 TESTED = 0.3
 _SMALLEST_NORM = 1e-6
-
-
-def subgoal_columns(goal_size: int) -> int:
-    """Return the number of values after an action: the subgoal and whether it is tested."""
-    return goal_size + 1
 
 
 def subgoals_of(starts: Starts, generator: np.random.Generator | None = None) -> Array32:
@@ -54,11 +47,6 @@ def subgoals_of(starts: Starts, generator: np.random.Generator | None = None) ->
     episodes = starts.episodes
     size = episodes.desired_goal.shape[-1]
     return episodes.action[starts.row, starts.tick, -size - 1 : -1]
-
-
-def tested(starts: Starts) -> NDArray[np.bool_]:
-    """Return whether transitions begin in a test, (batch,)."""
-    return np.asarray(starts.episodes.action[starts.row, starts.tick, -1] > 0.5)
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +66,7 @@ class Proposer:
     std: Array32
     is_pose: bool
 
-    def normalized(self, observation: Mapping[str, ArrayLike]) -> Array32:
+    def normalized(self, observation: Observations) -> Array32:
         """Return proposals (N, goal size) in standard deviations from the mean."""
         share: Array32 = self.policy.predict(observation, deterministic=True)[0]
         return NORMALIZED_CLIP * share
@@ -90,66 +78,6 @@ class Proposer:
             norm = np.linalg.norm(goals[:, 3:], axis=-1, keepdims=True)
             goals[:, 3:] /= np.maximum(norm, _SMALLEST_NORM)
         return goals.astype(np.float32)
-
-
-class Guide:
-    """Replaces the goals of the actor by subgoals, in each of several simulations.
-
-    Args:
-        every: Ticks for which a subgoal holds.
-        noise_std: Standard deviation of the noise on proposals, in standard deviations of goals.
-        random_epsilon: Probability of a random goal instead, each value normal with the mean and
-            deviation of goals.
-
-    Attributes:
-        share: Factor on `noise_std` and `random_epsilon`, 0 ... 1.
-    """
-
-    def __init__(
-        self, every: int, generator: np.random.Generator, noise_std: float, random_epsilon: float
-    ) -> None:
-        self._every = every
-        self._generator = generator
-        self._std, self._epsilon = noise_std, random_epsilon
-        self.share = 1.0
-        self._subgoal: Array32 = np.zeros((0, 0), np.float32)
-        self._tested = np.zeros(0, np.bool_)
-
-    def lead(
-        self, observation: Mapping[str, ArrayLike], proposer: Proposer | None, tick: int
-    ) -> dict[str, ArrayLike]:
-        """Return the observation with the subgoal as the desired goal.
-
-        Args:
-            proposer: The high level; with None the subgoal is the goal itself and never tested.
-            tick: Tick of the episode.
-        """
-        if tick % self._every == 0:
-            self._subgoal = np.asarray(observation['desired_goal'], np.float32)
-            self._tested = np.zeros(len(self._subgoal), np.bool_)
-            if proposer is not None:
-                self._propose(observation, proposer)
-        return {**observation, 'desired_goal': self._subgoal}
-
-    def _propose(self, observation: Mapping[str, ArrayLike], proposer: Proposer) -> None:
-        generator, count = self._generator, len(self._subgoal)
-        drawn = generator.standard_normal(self._subgoal.shape, dtype=np.float32)
-        own = proposer.normalized(observation)
-        replaced = generator.random(count) < self.share * self._epsilon
-        noisy = own + np.float32(self.share * self._std) * drawn
-        self._subgoal = proposer.goals(np.where(replaced[:, None], drawn, noisy))
-        self._tested = generator.random(count) < TESTED
-
-    def mark(self, noisy: Array32, own: Array32) -> Array32:
-        """Return actions (N, action size + goal size + 1); tests use the actor's own action.
-
-        Args:
-            noisy: Actions with noise, (N, action size).
-            own: Actions of the actor, (N, action size).
-        """
-        tests = self._tested[:, None]
-        taken = np.where(tests, own, noisy)
-        return np.concatenate([taken, self._subgoal, tests], axis=1, dtype=np.float32)
 
 
 class GuidedPolicy:
@@ -183,35 +111,49 @@ class GuidedPolicy:
 
 
 class GuidedCollector(Collector):
-    """Collects with a `GuidedPolicy`; its proposals get noise, too.
+    """Replaces the goals of the actor by proposals of a `GuidedPolicy`, with noise on both.
 
-    Args:
-        seeds: As for `Collector`.
-        every: Ticks for which a subgoal holds.
+    The noise on proposals is in standard deviations of goals. A random proposal is normal with the
+    mean and deviation of goals. The actions of an episode are followed by the subgoal and by
+    whether it is tested. Arguments as `Collector`.
     """
 
-    def __init__(
-        self, simulation: Simulation, seeds: list[int], config: TrainConfig, every: int
-    ) -> None:
-        columns = subgoal_columns(simulation.spec.goal.size)
-        super().__init__(simulation, seeds, config, extra_columns=columns)
-        self._guide = Guide(every, self._generator, config.noise_std, config.random_epsilon)
+    def __init__(self, simulation: Simulation, seeds: list[int], config: TrainConfig) -> None:
+        super().__init__(simulation, seeds, config, extra_columns=simulation.spec.goal.size + 1)
+        self._config = config
         self._proposer: Proposer | None = None
+        self._subgoal: Array32 = np.zeros((0, 0), np.float32)
+        self._tested = np.zeros(0, np.bool_)
 
     def _begin(self, policy: Policy) -> Policy:
-        self._guide.share = self.exploration
         self._proposer = None
         if isinstance(policy, GuidedPolicy):
-            self._proposer = policy.proposer
-            policy = policy.actor
+            self._proposer, policy = policy.proposer, policy.actor
         return super()._begin(policy)
 
     def _explore(
         self, policy: Policy, observation: Observations, past: Array32, tick: int
     ) -> Array32:
-        observation = self._guide.lead(observation, self._proposer, tick)
-        own = self._predict(policy, observation, past)
-        return self._guide.mark(self._noise.around(own, tick), own)
+        if tick % self._config.subgoal_every == 0:
+            self._propose(observation)
+        own = self._predict(policy, {**observation, 'desired_goal': self._subgoal}, past)
+        tests = self._tested[:, None]
+        # Tests use the actor's own action.
+        taken = np.where(tests, own, self._noise.around(own, tick))
+        return np.concatenate([taken, self._subgoal, tests], axis=1, dtype=np.float32)
+
+    def _propose(self, observation: Observations) -> None:
+        goal = np.asarray(observation['desired_goal'], np.float32)
+        self._subgoal, self._tested = goal, np.zeros(len(goal), np.bool_)
+        if self._proposer is None:
+            return
+        generator, config, share = self._generator, self._config, self.exploration
+        drawn = generator.standard_normal(goal.shape, dtype=np.float32)
+        own = self._proposer.normalized(observation)
+        replaced = generator.random(len(goal)) < share * config.random_epsilon
+        noisy = own + np.float32(share * config.noise_std) * drawn
+        self._subgoal = self._proposer.goals(np.where(replaced[:, None], drawn, noisy))
+        self._tested = generator.random(len(goal)) < TESTED
 
 
 # Share of a batch that begins where a proposal was made. With tests of 0.3 of the proposals about a
@@ -244,17 +186,10 @@ class HierarchicalTransitions(Transitions):
     high: Transitions
 
 
-@dataclass(frozen=True, slots=True)
-class SubgoalSampler:
-    """Makes transitions of the high level.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SubgoalSampler(TransitionSampler):
+    """Makes transitions of the high level; `most_steps` is the number of ticks of a subgoal."""
 
-    Attributes:
-        sampler: Computes rewards and has the discount of one tick.
-        every: Ticks for which a subgoal holds.
-    """
-
-    sampler: TransitionSampler
-    every: int
     missed_value: float
 
     def sample(
@@ -263,33 +198,23 @@ class SubgoalSampler:
         row: NDArray[np.int64],
         mixture: dict[str, float],
         generator: np.random.Generator,
+        valid_ticks: NDArray[np.int64] | None = None,
     ) -> Transitions:
-        """Draw a transition of each chosen episode with relabelled goal and hindsight action.
-
-        Args:
-            episodes: Episodes to draw from, no shorter than `every`.
-            row: Episode of each transition, (batch,).
-            mixture: Probability of each goal source; adds up to 1.
-        """
+        """As `TransitionSampler`, from episodes no shorter than a subgoal."""
+        del valid_ticks
         starts = Starts(episodes, row, self._ticks(episodes, len(row), generator))
-        source = draw_sources(mixture, len(row), generator)
-        goal = goals_of(starts, source, list(mixture), generator)
-
-        def reward_after(achieved: Array32, chosen: NDArray[np.int64]) -> NDArray[np.float64]:
-            goals = achieved.astype(np.float64), goal[chosen].astype(np.float64)
-            return np.asarray(self.sampler.compute_reward(*goals))
-
-        steps = np.full(len(row), self.every)
-        batch = self.sampler.several(starts, steps, goal, reward_after)
-        achieved = episodes.achieved_goal[row, starts.tick + self.every]
+        goal = self.relabel(starts, mixture, generator)
+        steps = np.full(len(row), self.most_steps)
+        batch = self.transitions(starts, steps, goal, generator)
+        achieved = episodes.achieved_goal[row, starts.tick + self.most_steps]
         return self._with_tests(starts, replace(batch, action=achieved))
 
     def _ticks(
         self, episodes: Episodes, count: int, generator: np.random.Generator
     ) -> NDArray[np.int64]:
         """Draw the first ticks (count,): a share of them where a proposal was made."""
-        last = episodes.ticks - self.every
-        decision = self.every * generator.integers(last // self.every + 1, size=count)
+        last, every = episodes.ticks - self.most_steps, self.most_steps
+        decision = every * generator.integers(last // every + 1, size=count)
         anywhere = generator.integers(last + 1, size=count)
         return np.where(generator.random(count) < _DECISIONS, decision, anywhere)
 
@@ -297,8 +222,9 @@ class SubgoalSampler:
         """Return the batch; missed tests have the lowest value for any goal."""
         subgoal = subgoals_of(starts)
         pairs = batch.action.astype(np.float64), subgoal.astype(np.float64)
-        reward = self.sampler.compute_reward(*pairs)
-        missed = tested(starts) & (starts.tick % self.every == 0) & (reward < 0.0)
+        reward = self.compute_reward(*pairs)
+        tested = starts.episodes.action[starts.row, starts.tick, -1] > 0.5
+        missed = tested & (starts.tick % self.most_steps == 0) & (reward < 0.0)
         return replace(
             batch,
             action=np.where(missed[:, None], subgoal, batch.action),
@@ -314,10 +240,15 @@ class HierarchicalExperience(Experience):
         """Draw the transitions of one update of both levels."""
         del env_steps
         config, mixture = self.config, self.mixture()
-        every = config.subgoal_every
         low = self._draw(with_subgoals(mixture))
         rows = self._draw_rows()
-        subgoals = SubgoalSampler(self._sampler, every, config.lowest_value)
+        subgoals = SubgoalSampler(
+            compute_reward=self._sampler.compute_reward,
+            gamma=self._sampler.gamma,
+            most_steps=config.subgoal_every,
+            reward_scale=self._sampler.reward_scale,
+            missed_value=config.lowest_value,
+        )
         high = subgoals.sample(self.replay.episodes, rows, mixture, self.generator)
         values = {name: getattr(low, name) for name in Transitions.__slots__}
         values['action'] = low.action[:, : self._spec.robot.action_size]
@@ -325,27 +256,15 @@ class HierarchicalExperience(Experience):
 
 
 class HighLevel(DDPG):
-    """The learner of the high level: its actions are goals.
+    """The learner of the high level, whose actions are goals, above a learner of actions."""
 
-    Args:
-        parts: As for `DDPG`.
-    """
-
-    def __init__(
-        self,
-        shape: NetworkShape,
-        config: TrainConfig,
-        device: torch.device,
-        workers: Workers,
-        parts: Parts | None,
-        actor: Actor,
-    ) -> None:
-        shape = replace(shape, action_size=shape.goal_size)
+    def __init__(self, shape: NetworkShape, low: DDPG) -> None:
         # A penalty of large actions would prefer goals in the middle of all goals.
-        config = replace(config, action_l2=0.0)
-        super().__init__(shape, config, device, workers, parts)
-        self.actor.observation_normalizer = actor.observation_normalizer
-        self.actor.goal_normalizer = actor.goal_normalizer
+        config = replace(low.config, action_l2=0.0)
+        shape = replace(shape, action_size=shape.goal_size)
+        super().__init__(shape, config, low.device, low.workers, low.parts)
+        self.actor.observation_normalizer = low.actor.observation_normalizer
+        self.actor.goal_normalizer = low.actor.goal_normalizer
         self._is_pose = task_spec(config.task).goal is GoalKind.POSE
 
     def tensors(self, batch: Transitions) -> TensorBatch:
@@ -364,26 +283,12 @@ class HighLevel(DDPG):
 class HierarchicalDDPG(DDPG):
     """The actor, which learns as in `DDPG`, and a high level; arguments as `DDPG`."""
 
-    def __init__(
-        self,
-        shape: NetworkShape,
-        config: TrainConfig,
-        device: torch.device,
-        workers: Workers,
-        parts: Parts | None = None,
-    ) -> None:
-        super().__init__(shape, config, device, workers, parts)
-        self.high = HighLevel(shape, config, device, workers, parts, self.actor)
+    def _set_up(self, shape: NetworkShape) -> None:
+        self.high = HighLevel(shape, self)
 
     def update(self, batch: Transitions) -> Losses:
-        """Improve both levels on a batch and return the losses of the actor.
-
-        Raises:
-            TypeError: If the batch has no transitions of the high level.
-        """
-        if not isinstance(batch, HierarchicalTransitions):
-            found = type(batch).__name__
-            raise TypeError(f'two levels learn from HierarchicalTransitions, not {found}')
+        """Improve both levels on a batch and return the losses of the actor."""
+        assert isinstance(batch, HierarchicalTransitions)
         # A training state contains only the number of updates of the actor.
         self.high.updates = self.updates
         self.high.update(batch.high)

@@ -9,6 +9,7 @@ return before the first action that is far from the actor's for the same goal.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -26,34 +27,31 @@ from policy_node.training.learners.ddpg import DDPG, CriticLoss
 CANDIDATES = 8
 
 
-class Judge:
-    """Scores transitions by the networks of a learner."""
+@torch.no_grad()
+def bellman(learner: DDPG, batch: Transitions) -> Array32:
+    """Return the absolute error of each value, (batch,), averaged over critics."""
+    with learner.precision():
+        errors = CriticLoss.errors(learner.critic_loss, learner, learner.tensors(batch))
+    error = errors.abs().float()
+    found: Array32 = (error if error.ndim == 1 else error.mean(dim=0)).cpu().numpy()
+    return found
 
-    def __init__(self, learner: DDPG) -> None:
-        self._learner = learner
 
-    def act(self, observation: Array32, goal: Array32) -> Array32:
-        """Return actions (batch, action_size) of the actor."""
-        return self._learner.act(observation, goal)
+@torch.no_grad()
+def uncertain(learner: DDPG, batch: Transitions) -> Array32:
+    """Return the standard deviation of each value over critics, (batch,)."""
+    tensors = learner.tensors(batch)
+    with learner.precision():
+        value = learner.critic(tensors.features, tensors.action).float()
+    spread: Array32 = value.std(dim=0).cpu().numpy()
+    return spread
 
-    @torch.no_grad()
-    def bellman(self, batch: Transitions) -> Array32:
-        """Return the absolute error of each value, (batch,), averaged over critics."""
-        learner = self._learner
-        with learner.precision():
-            errors = CriticLoss.errors(learner.critic_loss, learner, learner.tensors(batch))
-        error = errors.abs().float()
-        found: Array32 = (error if error.ndim == 1 else error.mean(dim=0)).cpu().numpy()
-        return found
 
-    @torch.no_grad()
-    def uncertain(self, batch: Transitions) -> Array32:
-        """Return the standard deviation of each value over critics, (batch,)."""
-        learner, tensors = self._learner, self._learner.tensors(batch)
-        with learner.precision():
-            value = learner.critic(tensors.features, tensors.action).float()
-        spread: Array32 = value.std(dim=0).cpu().numpy()
-        return spread
+SCORES: dict[str, Callable[[DDPG, Transitions], Array32]] = {
+    'bellman': bellman,
+    'uncertain': uncertain,
+}
+"""Scores of transitions by `goal_choice`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,10 +59,10 @@ class JudgedSampler(TransitionSampler):
     """A sampler that may ask a learner.
 
     Attributes:
-        judge: Scores of the learner; without one the sampler is a `TransitionSampler`.
+        judge: The learner; without it the sampler is a `TransitionSampler`.
     """
 
-    judge: Judge | None = None
+    judge: DDPG | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,7 +90,7 @@ class ChoosingSampler(JudgedSampler):
         return goal
 
     def _best(
-        self, judge: Judge, starts: Starts, first: Array32, generator: np.random.Generator
+        self, judge: DDPG, starts: Starts, first: Array32, generator: np.random.Generator
     ) -> Array32:
         """Return the best of several future goals of each transition, (batch, goal_size)."""
         candidates, source = [first], np.zeros(len(first), np.intp)
@@ -100,7 +98,7 @@ class ChoosingSampler(JudgedSampler):
             candidates.append(goals_of(starts, source, ['future'], generator))
         repeated = starts.select(np.tile(np.arange(len(first)), CANDIDATES))
         batch = self.single(repeated, np.concatenate(candidates))
-        score = judge.bellman(batch) if self.choice == 'bellman' else judge.uncertain(batch)
+        score = SCORES[self.choice](judge, batch)
         # The first of equals.
         best: NDArray[np.intp] = score.reshape(CANDIDATES, -1).argmax(axis=0)
         return np.stack(candidates)[best, np.arange(len(first))]
@@ -154,13 +152,12 @@ class CuttingSampler(JudgedSampler):
 class JudgedExperience(Experience):
     """Batches from a `JudgedSampler`. Statistics are collected without the judge."""
 
-    judge: Judge
+    judge: DDPG
 
     def _draw(self, mixture: dict[str, float]) -> Transitions:
         unjudged = self._sampler
         assert isinstance(unjudged, JudgedSampler)
         self._sampler = replace(unjudged, judge=self.judge)
-        try:
-            return super()._draw(mixture)
-        finally:
-            self._sampler = unjudged
+        batch = super()._draw(mixture)
+        self._sampler = unjudged
+        return batch

@@ -9,6 +9,7 @@ normalizers include the new episodes; from the fourth cycle on the difference is
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -20,13 +21,30 @@ from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.experience.replay import Transitions
 from policy_node.training.learners.actor_critic import ActorCritic, Losses
 from policy_node.training.machine import Workers
-from policy_node.training.research.rollouts import RolloutTransitions
 
 # Largest change of the probability of an action in an update (the paper's value).
 CLIP = 0.2
 # Logarithm of the largest ratio of probabilities: the exponential of 89 is beyond float32.
 LARGEST_LOG_RATIO = 20.0
 _ROOT = math.sqrt(2.0 * math.pi)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RolloutTransitions(Transitions):
+    """Transitions of the newest rollouts.
+
+    Attributes:
+        log_probability: (batch,) of the action, by the actor before the first update that uses the
+            rollouts. Its normalizers include the new episodes, which matters in the first cycles.
+        advantage: (batch,) of the action, with standard deviation 1.
+        value_target: (batch,) target value of the state.
+        weight: (batch,) weight of the transition in all losses.
+    """
+
+    log_probability: Array32
+    advantage: Array32
+    value_target: Array32
+    weight: Array32
 
 
 class PPO(ActorCritic):
@@ -47,13 +65,8 @@ class PPO(ActorCritic):
         super().__init__(actor, critic, config, device, workers)
 
     def update(self, batch: Transitions) -> Losses:
-        """Improve critic and actor on a batch of rollouts.
-
-        Raises:
-            TypeError: If the batch does not come from rollouts.
-        """
-        if not isinstance(batch, RolloutTransitions):
-            raise TypeError(f'PPO learns from RolloutTransitions, not {type(batch).__name__}')
+        """Improve critic and actor on a batch of rollouts."""
+        assert isinstance(batch, RolloutTransitions)
         features = self.actor.features(self.tensor(batch.observation), self.tensor(batch.goal))
         weight = self.tensor(batch.weight)
         value = self.critic(features).squeeze(-1)
@@ -74,8 +87,8 @@ class PPO(ActorCritic):
         advantage = self.tensor(batch.advantage)
         bounded = ratio.clamp(1.0 - CLIP, 1.0 + CLIP)
         gain = torch.minimum(ratio * advantage, bounded * advantage)
-        loss: Tensor = -(weight * gain).mean() + self.config.action_l2 * mean.square().mean()
-        return loss
+        cost: Tensor = self.config.action_l2 * mean.square().mean()
+        return cost - (weight * gain).mean()
 
     @torch.no_grad()
     def values(self, observation: Array32, goal: Array32) -> Array32:

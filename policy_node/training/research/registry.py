@@ -24,48 +24,25 @@ from policy_node.training.learners.actor_critic import ActorCritic
 from policy_node.training.learners.ddpg import DDPG, Parts, TargetNetworks
 from policy_node.training.learners.imagined import ImaginingDDPG
 from policy_node.training.machine import Workers
-from policy_node.training.research.conditions import (
-    ConditionedDDPG,
-    ConditionedSampler,
-    acting_input,
-    make_condition,
-    without_input,
+from policy_node.training.research import (
+    conditions,
+    critics,
+    density_ratio,
+    frequent_actions,
+    gamble,
+    hierarchy,
+    judged,
+    rollouts,
 )
+from policy_node.training.research.conditions import acting_input, without_input
 from policy_node.training.research.critics import (
-    AdvantageDDPG,
     Ensemble,
-    NoTargets,
     count_critics,
-    critic_loss,
     critic_tensors,
     is_ensemble,
 )
-from policy_node.training.research.density_ratio import WeightedDDPG
-from policy_node.training.research.frequent_actions import (
-    HoldingCollector,
-    HoldingDDPG,
-    HoldingSampler,
-    PerturbingCollector,
-    plain_actor,
-)
-from policy_node.training.research.gamble import GambleSimulation, without_landings
-from policy_node.training.research.hierarchy import (
-    LOW_SOURCES,
-    GuidedCollector,
-    HierarchicalDDPG,
-    HierarchicalExperience,
-    subgoal_columns,
-)
-from policy_node.training.research.judged import (
-    ChoosingSampler,
-    CuttingSampler,
-    Judge,
-    JudgedExperience,
-    JudgedSampler,
-    LambdaSampler,
-)
+from policy_node.training.research.frequent_actions import plain_actor
 from policy_node.training.research.ppo import PPO
-from policy_node.training.research.rollouts import OnPolicyExperience, RolloutSampler
 
 __all__ = [
     'Ensemble',
@@ -85,11 +62,11 @@ __all__ = [
 
 # Learners that take the place of `DDPG`, by the field that selects them.
 _LEARNERS: dict[str, type[DDPG]] = {
-    'subgoal_every': HierarchicalDDPG,
-    'condition': ConditionedDDPG,
-    'longest_hold': HoldingDDPG,
-    'advantage': AdvantageDDPG,
-    'importance': WeightedDDPG,
+    'subgoal_every': hierarchy.HierarchicalDDPG,
+    'condition': conditions.ConditionedDDPG,
+    'longest_hold': frequent_actions.HoldingDDPG,
+    'advantage': critics.AdvantageDDPG,
+    'importance': density_ratio.WeightedDDPG,
     'subgoal_prior': ImaginingDDPG,
 }
 
@@ -104,16 +81,16 @@ def make_simulation(config: TrainConfig, num_envs: int, num_threads: int) -> Sim
         'control_hz': config.control_hz,
         'disturbances': config.disturbances,
     }
-    return (GambleSimulation if config.gamble else Simulation)(config.task, **options)
+    return (gamble.GambleSimulation if config.gamble else Simulation)(config.task, **options)
 
 
 def make_collector(simulation: Simulation, seeds: list[int], config: TrainConfig) -> Collector:
     """Return the collector; arguments as `Collector`."""
     if config.longest_hold > 1:
-        return HoldingCollector(simulation, seeds, config, config.longest_hold)
+        return frequent_actions.HoldingCollector(simulation, seeds, config)
     if config.subgoal_every:
-        return GuidedCollector(simulation, seeds, config, config.subgoal_every)
-    kind = PerturbingCollector if config.parameter_noise else Collector
+        return hierarchy.GuidedCollector(simulation, seeds, config)
+    kind = frequent_actions.PerturbingCollector if config.parameter_noise else Collector
     return kind(simulation, seeds, config)
 
 
@@ -125,19 +102,21 @@ def make_sampler(config: TrainConfig, metric: GoalMetric) -> TransitionSampler:
     """
     fields = sampler_fields(config, metric)
     if config.longest_hold > 1:
-        return HoldingSampler(**fields | {'most_steps': config.longest_hold})
+        return frequent_actions.HoldingSampler(**fields | {'most_steps': config.longest_hold})
     if config.goal_choice != 'uniform':
-        return ChoosingSampler(**fields, choice=config.goal_choice)
-    if config.condition != 'none':
-        return ConditionedSampler(**fields, condition=make_condition(config, metric))
+        return judged.ChoosingSampler(**fields, choice=config.goal_choice)
+    if config.condition == 'horizon':
+        return conditions.HorizonSampler(**fields, ticks=metric.spec.episode_ticks)
+    if config.condition == 'threshold':
+        return conditions.threshold_sampler(fields, metric, config.widest_threshold)
     if config.correction == 'lambda':
-        return LambdaSampler(**fields, trace=config.trace)
+        return judged.LambdaSampler(**fields, trace=config.trace)
     if config.correction == 'cut':
-        return CuttingSampler(**fields)
+        return judged.CuttingSampler(**fields)
     if config.subgoal_every:
-        return TransitionSampler(**fields, sources=LOW_SOURCES)
+        return TransitionSampler(**fields, sources=hierarchy.LOW_SOURCES)
     if config.algorithm == 'ppo':
-        return RolloutSampler(**fields, metric=metric)
+        return rollouts.RolloutSampler(**fields, metric=metric)
     return TransitionSampler(**fields)
 
 
@@ -154,15 +133,15 @@ def make_learner(
     weigh = _weights_of(config, spec)
     if config.algorithm == 'ppo':
         ppo = PPO(network_shape(config), config, device, workers)
-        return ppo, OnPolicyExperience(*common, ppo, weigh)
+        return ppo, rollouts.OnPolicyExperience(*common, ppo, weigh)
     learner = make_ddpg(network_shape(config), config, device, workers)
     if config.subgoal_every:
-        columns = subgoal_columns(spec.goal.size)
-        return learner, HierarchicalExperience(*common, columns, weigh)
-    if isinstance(sampler, JudgedSampler):
-        judged = JudgedExperience(*common, weigh=weigh)
-        judged.judge = Judge(learner)
-        return learner, judged
+        # The subgoal, and whether it is tested.
+        return learner, hierarchy.HierarchicalExperience(*common, spec.goal.size + 1, weigh)
+    if isinstance(sampler, judged.JudgedSampler):
+        experience = judged.JudgedExperience(*common, weigh=weigh)
+        experience.judge = learner
+        return learner, experience
     return learner, Experience(*common, _extra_actions(config), weigh)
 
 
@@ -171,8 +150,8 @@ def make_ddpg(
 ) -> DDPG:
     """Return `DDPG` or the learner that takes its place; arguments as `DDPG`."""
     kinds = (kind for name, kind in _LEARNERS.items() if getattr(config, name) != DEFAULTS[name])
-    targets = NoTargets if config.target == 'none' else TargetNetworks
-    parts = Parts(critic_loss(config), targets)
+    targets = critics.NoTargets if config.target == 'none' else TargetNetworks
+    parts = Parts(critics.critic_loss(config), targets)
     return next(kinds, DDPG)(shape, config, device, workers, parts)
 
 
@@ -190,4 +169,4 @@ def _weights_of(config: TrainConfig, spec: TaskSpec) -> Weigh:
     """Return the function that finds episodes with a motion, the landing of a gamble left out."""
     if not config.gamble:
         return has_moved
-    return lambda episodes: has_moved(without_landings(episodes, spec))
+    return lambda episodes: has_moved(gamble.without_landings(episodes, spec))

@@ -23,8 +23,7 @@ taken (as HGG, Ren et al. 2019, arXiv 1906.04279), so goals approach those of th
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Protocol
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +34,7 @@ from msgs_spec.tasks import TaskSpec
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.experience.experience import Experience
 from policy_node.training.experience.hindsight import (
+    SOURCES,
     RewardFunction,
     displace,
     draw_sources,
@@ -50,6 +50,7 @@ from policy_node.training.experience.replay import (
 )
 from policy_node.training.experience.sampling import TransitionSampler
 from policy_node.training.machine import Workers
+from policy_node.training.research.ppo import PPO, RolloutTransitions
 
 _OUTCOME = 'outcome'
 # Number of episodes whose outcomes are used, states of each, and outcomes to choose from.
@@ -62,132 +63,76 @@ _SMALLEST_DEVIATION = 1e-6
 _LARGEST_RATIO, _LARGEST_TRACE = 10.0, 1.0
 
 
-class Critique(Protocol):
-    """Values of states and densities of actions, from a learner."""
-
-    def values(self, observation: Array32, goal: Array32) -> Array32:
-        """Return values (...,) of states (..., observation_size) for goals (..., goal_size)."""
-        ...
-
-    def log_probabilities(self, observation: Array32, goal: Array32, action: Array32) -> Array32:
-        """Return the logarithms (...,) of the densities of actions (..., action_size)."""
-        ...
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RolloutTransitions(Transitions):
-    """Transitions of the newest rollouts.
-
-    Attributes:
-        log_probability: (batch,) of the action, by the actor before the first update that uses the
-            rollouts. Its normalizers include the new episodes, which matters in the first cycles.
-        advantage: (batch,) of the action, with standard deviation 1.
-        value_target: (batch,) target value of the state.
-        weight: (batch,) weight of the transition in all losses.
-    """
-
-    log_probability: Array32
-    advantage: Array32
-    value_target: Array32
-    weight: Array32
-
-
-@dataclass(frozen=True, slots=True)
-class Rollouts:
-    """Episodes of T steps with their rewards and advantages.
-
-    Attributes:
-        reward: (episodes, T).
-        log_probability: (episodes, T) of the actions.
-        advantage: (episodes, T).
-        value_target: (episodes, T).
-        weight: (episodes, T).
-    """
-
-    episodes: Episodes
-    reward: Array32
-    log_probability: Array32
-    advantage: Array32
-    value_target: Array32
-    weight: Array32
-
-    def draw(
-        self, row: NDArray[np.int64], gamma: float, generator: np.random.Generator
-    ) -> RolloutTransitions:
-        """Draw a transition from each of these episodes, (batch,)."""
-        episodes, count = self.episodes, len(row)
-        tick = generator.integers(episodes.ticks, size=count)
-        return RolloutTransitions(
-            observation=episodes.observation[row, tick],
-            next_observation=episodes.observation[row, tick + 1],
-            goal=episodes.desired_goal[row],
-            action=episodes.action[row, tick],
-            reward=self.reward[row, tick],
-            discount=np.full(count, gamma, np.float32),
-            log_probability=self.log_probability[row, tick],
-            advantage=self.advantage[row, tick],
-            value_target=self.value_target[row, tick],
-            weight=self.weight[row, tick],
-        )
-
-
 @dataclass(frozen=True, slots=True)
 class RolloutMaker:
     """Makes rollouts of episodes.
 
     Attributes:
+        critique: Values of states and densities of actions.
         compute_reward: (achieved_goal, desired_goal) -> reward, batched.
         corrects: Whether replayed episodes get per-decision weights.
     """
 
-    critique: Critique
+    critique: PPO
     compute_reward: RewardFunction
     gamma: float
     trace: float
     corrects: bool
 
-    def make(self, episodes: Episodes, goals: Sequence[Array32]) -> Rollouts:
-        """Return rollouts of episodes with their own goals, and with each of `goals`.
+    def make(self, episodes: Episodes, goals: Sequence[Array32]) -> RolloutTransitions:
+        """Return all transitions of episodes with their own goals, and with each of `goals`.
 
         Args:
             goals: Goals (episodes, goal_size) to replay them for.
+
+        Returns:
+            The transitions, episode by episode; advantages have weighted mean 0 and deviation 1.
         """
         own = self._under(episodes)
-        meant = own.log_probability if self.corrects else None
+        meant = own['log_probability'] if self.corrects else None
         replayed = [self._under(replace(episodes, desired_goal=goal), meant) for goal in goals]
-        if self.corrects and replayed:
-            logs = [rollouts.log_probability - own.log_probability for rollouts in replayed]
-            weights = np.split(decision_weights(np.concatenate(logs)), len(logs))
-            replayed = [
-                replace(rollouts, weight=weight.astype(np.float32))
-                for rollouts, weight in zip(replayed, weights, strict=True)
-            ]
-        return _joined([own, *replayed])
+        all_of = {name: np.concatenate([own[name], *(r[name] for r in replayed)]) for name in own}
+        advantage, weight, logs = (
+            all_of[name] for name in ('advantage', 'weight', 'log_probability')
+        )
+        if meant is not None and goals:
+            of_replayed = slice(len(episodes), None)
+            log_ratio = logs[of_replayed] - np.tile(meant, (len(goals), 1))
+            weight[of_replayed] = decision_weights(log_ratio)
+        mean = np.average(advantage, weights=weight)
+        deviation = np.sqrt(np.average(np.square(advantage - mean), weights=weight))
+        advantage = ((advantage - mean) / max(deviation, _SMALLEST_DEVIATION)).astype(np.float32)
+        all_of['advantage'] = advantage
+        flat = {name: values.reshape(-1, *values.shape[2:]) for name, values in all_of.items()}
+        return RolloutTransitions(**flat)
 
-    def _under(self, episodes: Episodes, meant: Array32 | None = None) -> Rollouts:
-        """Return rollouts for the goals that the episodes have.
+    def _under(self, episodes: Episodes, meant: Array32 | None = None) -> dict[str, Array32]:
+        """Return the transitions (episodes, T, ...) for the goals that the episodes have.
 
         Args:
             meant: Log probabilities (episodes, T) of the actions for their original goals; None
                 treats the goals of the episodes as the original ones.
         """
-        count, ticks = len(episodes), episodes.ticks
-        goal = np.repeat(episodes.desired_goal[:, None], ticks + 1, axis=1)
+        observation, action = episodes.observation, episodes.action
+        goal = np.repeat(episodes.desired_goal[:, None], episodes.ticks + 1, axis=1)
         achieved = episodes.achieved_goal[:, 1:].astype(np.float64)
         reward = np.asarray(self.compute_reward(achieved, goal[:, 1:].astype(np.float64)))
-        value = self.critique.values(episodes.observation, goal).astype(np.float64)
-        states = episodes.observation[:, :-1], goal[:, :-1]
-        log_probability = self.critique.log_probabilities(*states, episodes.action)
-        log_ratio = None if meant is None else log_probability - meant
+        value = self.critique.values(observation, goal).astype(np.float64)
+        logs = self.critique.log_probabilities(observation[:, :-1], goal[:, :-1], action)
+        log_ratio = None if meant is None else logs - meant
         advantage = advantages(reward, value, self.gamma, self.trace, log_ratio)
-        return Rollouts(
-            episodes,
-            reward.astype(np.float32),
-            log_probability,
-            advantage.astype(np.float32),
-            (advantage + value[:, :-1]).astype(np.float32),
-            np.ones((count, ticks), np.float32),
-        )
+        return {
+            'observation': observation[:, :-1],
+            'next_observation': observation[:, 1:],
+            'goal': goal[:, :-1],
+            'action': action,
+            'reward': reward.astype(np.float32),
+            'discount': np.full(reward.shape, self.gamma, np.float32),
+            'log_probability': logs,
+            'advantage': advantage.astype(np.float32),
+            'value_target': (advantage + value[:, :-1]).astype(np.float32),
+            'weight': np.ones(reward.shape, np.float32),
+        }
 
 
 def advantages(
@@ -230,25 +175,6 @@ def decision_weights(log_ratio: NDArray[np.floating]) -> Array:
     return np.asarray(weight / weight.mean(axis=0))
 
 
-def _joined(parts: Sequence[Rollouts]) -> Rollouts:
-    """Return all rollouts, with advantages of weighted mean 0 and deviation 1."""
-    episodes = Episodes(
-        *(
-            np.concatenate([getattr(part.episodes, name) for part in parts])
-            for name in Episodes.__slots__
-        )
-    )
-    reward, log_probability, advantage, target, weight = (
-        np.concatenate([getattr(part, name) for part in parts])
-        for name in Rollouts.__slots__
-        if name != 'episodes'
-    )
-    mean = np.average(advantage, weights=weight)
-    deviation = np.sqrt(np.average(np.square(advantage - mean), weights=weight))
-    advantage = ((advantage - mean) / max(deviation, _SMALLEST_DEVIATION)).astype(np.float32)
-    return Rollouts(episodes, reward, log_probability, advantage, target, weight)
-
-
 @dataclass(frozen=True, slots=True)
 class Outcomes:
     """First achieved goals of episodes, and later ones that differ from them.
@@ -274,14 +200,17 @@ class Outcomes:
     def __len__(self) -> int:
         return len(self.after)
 
-    def goals(self, episodes: Episodes, generator: np.random.Generator) -> Array32:
-        """Return a goal for each whole episode, (episodes, goal_size)."""
-        count = len(episodes)
+    def goals(self, starts: Starts, generator: np.random.Generator) -> Array32:
+        """Return a goal for each whole episode, (batch, goal_size); its own without outcomes."""
+        desired = starts.episodes.desired_goal[starts.row]
+        if not len(self):
+            return desired
+        count = len(desired)
         drawn = generator.integers(len(self), size=_CANDIDATES * count)
-        start = np.tile(episodes.achieved_goal[:, 0], (_CANDIDATES, 1))
+        start = np.tile(starts.episodes.achieved_goal[starts.row, 0], (_CANDIDATES, 1))
         candidates = displace(start, self.before[drawn], self.after[drawn])
-        desired = np.tile(episodes.desired_goal, (_CANDIDATES, 1))
-        near = self.metric.with_changes(reward_type='dense').reward(candidates, desired)
+        wanted = np.tile(desired, (_CANDIDATES, 1))
+        near = self.metric.with_changes(reward_type='dense').reward(candidates, wanted)
         best = near.reshape(_CANDIDATES, count).argmax(axis=0)
         goals: Array32 = candidates[best * count + np.arange(count)]
         return goals
@@ -296,18 +225,13 @@ def goals_in_hindsight(
     """Return a goal for each whole episode, (episodes, goal_size), from the sources of a mixture.
 
     Args:
-        outcomes: Outcomes of other episodes for the source `outcome`; without any the goal stays.
+        outcomes: Outcomes of other episodes for the source `outcome`.
     """
-    count, names = len(episodes), list(mixture)
+    count = len(episodes)
     starts = Starts(episodes, np.arange(count), np.zeros(count, np.int64))
     source = draw_sources(mixture, count, generator)
-    sources = ['real' if name == _OUTCOME else name for name in names]
-    goal = goals_of(starts, source, sources, generator)
-    if outcomes is None or not len(outcomes):
-        return goal
-    transferred = np.flatnonzero(np.array(names)[source] == _OUTCOME)
-    goal[transferred] = outcomes.goals(episodes, generator)[transferred]
-    return goal
+    sources = SOURCES if outcomes is None else {**SOURCES, _OUTCOME: outcomes.goals}
+    return goals_of(starts, source, list(mixture), generator, sources)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -332,7 +256,7 @@ class OnPolicyExperience(Experience):
         workers: Workers,
         sampler: TransitionSampler,
         generator: np.random.Generator,
-        critique: Critique,
+        critique: PPO,
         weigh: Weigh = has_moved,
     ) -> None:
         super().__init__(config, spec, workers, sampler, generator, weigh=weigh)
@@ -340,7 +264,7 @@ class OnPolicyExperience(Experience):
         self._maker = RolloutMaker(critique, sampler.compute_reward, *limits)
         self._metric = sampler.metric if isinstance(sampler, RolloutSampler) else None
         self._newest = workers.share(config.num_envs)
-        self._rollouts: Rollouts | None = None
+        self._rollouts: RolloutTransitions | None = None
         self._made_after = -1
         self._weight_up_to = np.zeros(0)
 
@@ -348,8 +272,12 @@ class OnPolicyExperience(Experience):
         """Draw from the rollouts of the newest cycle; its first call makes them."""
         if self._rollouts is None or env_steps != self._made_after:
             self._rollouts, self._made_after = self._roll_out(), env_steps
-            self._weight_up_to = np.cumsum(self._weigh(self._rollouts.episodes))
-        return self._rollouts.draw(self._draw_rows(), self.config.gamma, self.generator)
+        row, ticks = self._draw_rows(), self.replay.ticks
+        drawn = row * ticks + self.generator.integers(ticks, size=len(row))
+        rollouts = self._rollouts
+        return RolloutTransitions(
+            **{each.name: getattr(rollouts, each.name)[drawn] for each in fields(rollouts)}
+        )
 
     def _draw_rows(self) -> NDArray[np.int64]:
         generator, count, share = self.generator, self.batch_size, self.config.moved_share
@@ -369,7 +297,7 @@ class OnPolicyExperience(Experience):
             found['episode'] = found.get('episode', 0.0) + found.pop(_OUTCOME)
         return found
 
-    def _roll_out(self) -> Rollouts:
+    def _roll_out(self) -> RolloutTransitions:
         # Fewer episodes if a simulation diverged: older ones are of another actor.
         episodes = self.replay.newest(min(self._newest, self.replay.last_added))
         mixture = super().mixture()
@@ -381,4 +309,5 @@ class OnPolicyExperience(Experience):
         goals = [
             goals_in_hindsight(episodes, mixture, self.generator, outcomes) for _ in range(copies)
         ]
+        self._weight_up_to = np.cumsum(np.tile(self._weigh(episodes), copies + 1))
         return self._maker.make(episodes, goals)

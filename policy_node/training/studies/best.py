@@ -2,26 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from pathlib import Path
-from typing import Any
-
 from msgs_spec.tasks import TASKS, task_spec
-from policy_node.training.configuration.recipes import recipe_config
-from policy_node.training.studies.study import Arm, Job, Study
-
-BEST = Study(
-    'best',
-    None,
-    'What does each recipe reach?',
-    {},
-    (Arm('best', 'DDPG+HER, best recipe'),),
-    seeds=1,
-)
+from policy_node.training.studies.study import Arm, Start, Study
 
 # Long trainings first. Networks that can turn the block (XYZ) help in every other block task;
 # likewise for egg and pen.
-BEST_ORDER = (
+_ORDER = (
     'HandManipulateBlockRotateXYZ',
     'HandManipulateEggRotate',
     'HandManipulatePenRotate',
@@ -36,7 +22,7 @@ BEST_ORDER = (
     'FetchPush',
     'FetchReach',
 )
-STARTS_FROM = {
+_STARTS_FROM = {
     'HandManipulateBlockRotateParallel': 'HandManipulateBlockRotateXYZ',
     'HandManipulateBlockRotateZ': 'HandManipulateBlockRotateParallel',
     'HandManipulateBlockFull': 'HandManipulateBlockRotateXYZ',
@@ -65,33 +51,26 @@ _HELD = {
 }
 
 
-def start_from(task: str, networks: str) -> dict[str, Any]:
-    """Return the fields of a run that starts from networks of the task in `STARTS_FROM`."""
+# A job collects and learns at the same time, in a thread each.
+_OVERLAPPING = {'overlap': True, 'precision': 'auto'}
+
+
+def _start(task: str) -> Start:
+    """Return the start of a task in `_STARTS_FROM`."""
     coarse = _COARSE_FIRST if task_spec(task).position_counts else {}
     held = _HELD if 'Pen' in task else {}
-    return {**_FINE_TUNING, **coarse, **held, 'init_from': networks}
+    return Start(_STARTS_FROM[task], {**_FINE_TUNING, **coarse, **held})
 
 
-def best_jobs(
-    tasks: Sequence[str], seeds: Sequence[int], overrides: dict[str, Any], output: Path
-) -> list[Job]:
-    """Return the best recipe of each task, some starting from the networks of an earlier job.
+BEST = Study(
+    'best',
+    None,
+    'What does each recipe reach?',
+    {task: _OVERLAPPING for task in _ORDER},
+    (Arm('best', 'DDPG+HER, best recipe'),),
+    seeds=1,
+    starts={task: _start(task) for task in _STARTS_FROM},
+    ships=True,
+)
 
-    A task starts from random networks if its predecessor is not among the tasks.
-
-    Raises:
-        ValueError: If a value is not allowed.
-    """
-    jobs: dict[tuple[str, int], Job] = {}
-    (arm,) = BEST.arms
-    for seed in seeds:
-        for task in (name for name in BEST_ORDER if name in tasks):
-            before = jobs.get((STARTS_FROM.get(task, ''), seed))
-            start = start_from(task, str(before.folder)) if before else {}
-            config = recipe_config(task, 'best', **{**start, **overrides, 'seed': seed})
-            folder = output / task / arm.name / f'seed{seed}'
-            jobs[task, seed] = Job(arm, config, folder, before)
-    return list(jobs.values())
-
-
-assert set(BEST_ORDER) == set(TASKS)
+assert set(_ORDER) == set(TASKS)

@@ -20,7 +20,6 @@ import argparse
 import contextlib
 import os
 from collections.abc import Iterator, Sequence
-from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -29,7 +28,6 @@ from msgs_spec.tasks import TASKS
 from msgs_spec.text import did_you_mean, one_line
 from node_runtime.command_line import (
     EXIT_FAILURE,
-    EXIT_SUCCESS,
     CommandError,
     CommandParser,
     UsageError,
@@ -44,14 +42,14 @@ from policy_node.policies.loading import is_python_name, working_directory_first
 from policy_node.training.configuration.flat import whole, with_assignments
 from policy_node.training.runs.run_folder import BEST_FILE
 from policy_node.training.runs.shipping import ship
-from policy_node.training.studies.best import BEST, best_jobs
+from policy_node.training.studies.best import BEST
 from policy_node.training.studies.published import actors_table
 from policy_node.training.studies.report import write_study
 from policy_node.training.studies.research import STUDIES
 from policy_node.training.studies.store import holds, read_runs, require_alike
-from policy_node.training.studies.study import FINAL_EPISODES, Job, Study, research_jobs
+from policy_node.training.studies.study import FINAL_EPISODES, Job, Study
 from policy_node.training.studies.workers import (
-    JobsStopped,
+    Place,
     Processes,
     Ray,
     ThisProcess,
@@ -73,12 +71,12 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     )
     add = parser.add_argument
     help_of_study = f'{", ".join(_STUDIES)}, module:NAME; default: paper'
-    add('--study', type=_study_name, default='paper', metavar='NAME', help=help_of_study)
+    add('--study', type=find_study, default='paper', metavar='NAME', help=help_of_study)
     default = 'default: the first of the study; all of study best'
     add('--tasks', nargs='+', choices=list(TASKS), metavar='TASK', help=default)
     help_of_seeds = 'default: 0 to 4 (ingredients: 0 1; best: 0)'
     add('--seeds', nargs='+', type=_seed, metavar='SEED', help=help_of_seeds)
-    add('--arms', nargs='+', metavar='ARM', help='variants; default: all; not in study best')
+    add('--arms', nargs='+', metavar='ARM', help='variants; default: all')
     count = whole_number(1)
     add('--jobs', type=count, help='runs trained in parallel; default: 1; one per core')
     add('--steps', type=_whole, help='environment steps of each job')
@@ -91,14 +89,6 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     add('--ray', action='store_true', help='independent jobs on Ray (extra: cluster)')
     add('--actors', type=Path, help='folder of actors of study best; default: <output>/actors')
     return parser.parse_args(arguments)
-
-
-def _study_name(text: str) -> str:
-    try:
-        find_study(text)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error)) from None
-    return text
 
 
 def _whole(text: str) -> int:
@@ -120,27 +110,30 @@ def find_study(name: str) -> Study:
     """Return a study of this package or of a module.
 
     Raises:
-        ValueError: If the name is unknown, or the module fails.
+        ArgumentTypeError: If the name is unknown, or the module fails.
     """
-    if not is_python_name(name):
-        if name not in _STUDIES:
-            hint = did_you_mean(name, list(_STUDIES))
-            allowed = ', '.join(_STUDIES)
-            raise ValueError(f'{name[:80]!r} given; allowed: {allowed}, module:NAME{hint}')
+    if name in _STUDIES:
         return _STUDIES[name]
+    if not is_python_name(name):
+        hint, allowed = did_you_mean(name, list(_STUDIES)), ', '.join(_STUDIES)
+        line = f'{name[:80]!r} given; allowed: {allowed}, module:NAME{hint}'
+        raise argparse.ArgumentTypeError(line)
     module, _, attribute = name.partition(':')
     try:
         with working_directory_first():
             study = getattr(import_module(module), attribute)
     except (Exception, SystemExit) as error:
-        raise ValueError(f'{name}: {type(error).__name__}: {one_line(error)}') from None
+        line = f'{name}: {type(error).__name__}: {one_line(error)}'
+        raise argparse.ArgumentTypeError(line) from None
     if not isinstance(study, Study):
-        raise ValueError(f'{name} is a {type(study).__name__}; allowed: a Study')
-    if study.name in _STUDIES or not study.name.isidentifier():
-        raise ValueError(f'{name} is called {study.name!r}; allowed: a word that no other study is')
-    if not study.settings or not study.arms:
-        raise ValueError(f'{name} has no settings of a task, or no arms')
-    return study
+        line = f'{name} is a {type(study).__name__}; allowed: a Study'
+    elif study.name in _STUDIES or not study.name.isidentifier():
+        line = f'{name} is called {study.name!r}; allowed: a word that no other study is'
+    elif not study.settings or not study.arms:
+        line = f'{name} has no settings of a task, or no arms'
+    else:
+        return study
+    raise argparse.ArgumentTypeError(line)
 
 
 def jobs_from_arguments(options: argparse.Namespace) -> list[Job]:
@@ -149,22 +142,17 @@ def jobs_from_arguments(options: argparse.Namespace) -> list[Job]:
     Raises:
         ValueError: If a value is not allowed or differs from an existing run.
     """
-    study, output = find_study(options.study), _output(options)
-    if options.arms is not None and study is BEST:
-        raise ValueError('--arms does not belong to --study best')
-    if options.actors is not None and study is not BEST:
+    study: Study = options.study
+    if options.actors is not None and not study.ships:
         raise ValueError('--actors belongs to --study best')
-    overrides = _overrides(options, study)
-    seeds = list(dict.fromkeys(options.seeds or range(study.seeds)))
-    if study is BEST:
-        # A job collects and learns at the same time, in a thread each.
-        threads = {'simulation_threads': 1, 'torch_threads': 1}
-        jobs = best_jobs(options.tasks or list(TASKS), seeds, {**threads, **overrides}, output)
-    else:
-        tasks = list(dict.fromkeys(options.tasks or study.tasks[:1]))
-        arms = [study.arm(name) for name in dict.fromkeys(options.arms or ())] or study.arms
-        episodes = options.episodes or FINAL_EPISODES
-        jobs = research_jobs(study, tasks, arms, seeds, overrides, output, episodes)
+    jobs = study.jobs(
+        options.tasks or (study.tasks if study.ships else study.tasks[:1]),
+        [study.arm(name) for name in dict.fromkeys(options.arms or ())] or study.arms,
+        list(dict.fromkeys(options.seeds or range(study.seeds))),
+        _overrides(options, study),
+        options.output or study.output,
+        0 if study.ships else options.episodes or FINAL_EPISODES,
+    )
     for job in jobs:
         job.check_configuration()
     return jobs
@@ -189,18 +177,6 @@ def _overrides(options: argparse.Namespace, study: Study) -> dict[str, Any]:
     return overrides
 
 
-def _output(options: argparse.Namespace) -> Path:
-    study = find_study(options.study)
-    folder = Path('best') if study is BEST else Path('research') / study.name
-    return Path(options.output or Path('runs') / folder)
-
-
-def _report_folder(options: argparse.Namespace) -> Path:
-    study = find_study(options.study)
-    page = _output(options) if study is BEST else Path('docs') / 'research' / study.name
-    return Path(options.report or page)
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command and return its exit code."""
     options = parse_arguments(arguments)
@@ -211,21 +187,31 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _run(options: argparse.Namespace, command: str) -> int:
     if options.ray:
         require_extra('cluster')
-    study, report = find_study(options.study), _report_folder(options)
+    study: Study = options.study
+    output = options.output or study.output
+    report = options.report or (output if study.ships else Path('docs') / 'research' / study.name)
     with _usage_errors():
         jobs = jobs_from_arguments(options)
-        if study is not BEST:
+        if not study.ships:
             require_alike(study, jobs, report)
-    _make_folder(_output(options), 'runs')
-    _make_folder(report, 'a report')
-    if study is not BEST:
+    for folder, content in ((output, 'runs'), (report, 'a report')):
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise UsageError(f'{folder} cannot hold {content}: {error.strerror}') from None
+    if not study.ships:
         with _usage_errors():
             jobs = _not_stored(jobs, report)
-    renew = partial(_write_report, study, report)
+
+    def renew() -> None:
+        try:
+            write_study(study, report)
+        except (OSError, ValueError) as error:
+            raise CommandError(f'no report in {report}: {error}') from None
+
     try:
-        whole = _run_where_asked(options, jobs, command, renew)
-    except JobsStopped as stopped:
-        return stopped.exit_code
+        with _place(options, report, command) as place:
+            status = run_jobs(jobs, place, report, renew)
     finally:
         renew()
         finished = [job for job in jobs if is_finished(job, report)]
@@ -233,8 +219,9 @@ def _run(options: argparse.Namespace, command: str) -> int:
             count = f'{len(finished)} of {len(jobs)} jobs are finished'
             print(f'{count}; the same command continues the others')
     # Not after a stop: that would be thousands of episodes before the command ends.
-    shipped = options.study != 'best' or _ship_all(options, finished)
-    return EXIT_SUCCESS if whole and shipped else EXIT_FAILURE
+    if study.ships and status <= EXIT_FAILURE and not _ship_all(options, finished, output, report):
+        return EXIT_FAILURE
+    return status
 
 
 @contextlib.contextmanager
@@ -244,13 +231,6 @@ def _usage_errors() -> Iterator[None]:
         yield
     except (ValueError, TypeError) as error:
         raise UsageError(str(error)) from None
-
-
-def _make_folder(folder: Path, content: str) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UsageError(f'{folder} cannot hold {content}: {error.strerror}') from None
 
 
 def _not_stored(jobs: Sequence[Job], folder: Path) -> list[Job]:
@@ -263,31 +243,22 @@ def _not_stored(jobs: Sequence[Job], folder: Path) -> list[Job]:
     return missing
 
 
-def _run_where_asked(
-    options: argparse.Namespace, jobs: Sequence[Job], command: str, renew: partial[None]
-) -> bool:
-    report = _report_folder(options)
-    if options.ray:
-        return run_jobs(jobs, Ray(report, command), report, renew)
+def _place(
+    options: argparse.Namespace, report: Path, command: str
+) -> contextlib.AbstractContextManager[Place]:
+    """Return the place where the jobs run."""
     cores = len(os.sched_getaffinity(0))
-    limit = options.jobs or (cores if options.study == 'best' else 1)
+    limit = options.jobs or (cores if options.study.ships else 1)
+    if options.ray:
+        return contextlib.nullcontext(Ray(report, command))
     if limit == 1:
-        return run_jobs(jobs, ThisProcess(report, command), report, renew)
-    with Processes(limit, report, command) as processes:
-        return run_jobs(jobs, processes, report, renew)
+        return contextlib.nullcontext(ThisProcess(report, command))
+    return Processes(limit, report, command)
 
 
-def _write_report(study: Study, report: Path) -> None:
-    """Write the tables and the figure of the stored runs."""
-    try:
-        write_study(study, report)
-    except (OSError, ValueError) as error:
-        raise CommandError(f'no report in {report}: {error}') from None
-
-
-def _ship_all(options: argparse.Namespace, jobs: Sequence[Job]) -> bool:
+def _ship_all(options: argparse.Namespace, jobs: Sequence[Job], output: Path, report: Path) -> bool:
     """Evaluate the best actors and copy the better ones; return whether nothing failed."""
-    actors, whole = options.actors or _output(options) / 'actors', True
+    actors, whole = options.actors or output / 'actors', True
     for job in jobs:
         if not (job.folder / BEST_FILE).is_file():
             complain(_NAME, f'{job.name} has no best actor: no evaluation was whole')
@@ -298,7 +269,7 @@ def _ship_all(options: argparse.Namespace, jobs: Sequence[Job]) -> bool:
             complain(_NAME, f'{job.name} is not shipped: {error}')
             whole = False
     if whole and actors.is_dir():
-        table = _report_folder(options) / ACTORS_TABLE
+        table = report / ACTORS_TABLE
         try:
             write_file(table, f'{actors_table(actors)}\n'.encode())
         except (OSError, ValueError) as error:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -71,6 +72,19 @@ class Arm:
 
 
 @dataclass(frozen=True, slots=True)
+class Start:
+    """Trained networks from which the runs of a task start.
+
+    Attributes:
+        task: The task whose run trains them, earlier in the study.
+        fields: Fields of `TrainConfig` that preserve them.
+    """
+
+    task: str
+    fields: Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
 class Study:
     """One question, its variants and its budget.
 
@@ -82,6 +96,8 @@ class Study:
             They replace fields of the recipe `best`, or of the recipe that they name.
         arms: The variants; the first is the baseline.
         seeds: Default number of seeds.
+        starts: By task, the networks it starts from; random ones if that task is not trained too.
+        ships: Whether the best actors are evaluated and copied, instead of comparing runs.
     """
 
     name: str
@@ -90,11 +106,18 @@ class Study:
     settings: Mapping[str, Mapping[str, Any]]
     arms: tuple[Arm, ...]
     seeds: int = 5
+    starts: Mapping[str, Start] = field(default_factory=dict)
+    ships: bool = False
 
     @property
     def tasks(self) -> tuple[str, ...]:
         """The tasks that the study has settings for."""
         return tuple(self.settings)
+
+    @property
+    def output(self) -> Path:
+        """Default folder of the runs."""
+        return Path('runs') / ('' if self.ships else 'research') / self.name
 
     def arm(self, name: str) -> Arm:
         """Return a variant.
@@ -106,6 +129,51 @@ class Study:
         if name not in arms:
             raise ValueError(f'--arms {name!r}; allowed in {self.name}: {", ".join(arms)}')
         return arms[name]
+
+    def jobs(
+        self,
+        tasks: Sequence[str],
+        arms: Sequence[Arm],
+        seeds: Sequence[int],
+        overrides: Mapping[str, Any],
+        output: Path,
+        episodes: int = FINAL_EPISODES,
+    ) -> list[Job]:
+        """Return the runs by task, then seed by seed: a stopped study has as many of each variant.
+
+        Step counts scale with the action frequency: equal budgets in simulated time.
+
+        Args:
+            tasks: The tasks.
+            arms: The variants.
+            seeds: The seeds.
+            overrides: Fields of `TrainConfig` for all runs.
+            output: Folder of all runs.
+            episodes: Fresh episodes that measure the last actor of each run.
+
+        Raises:
+            ValueError: If a task or a value is not allowed.
+        """
+        for task in tasks:
+            if task not in self.settings:
+                raise ValueError(f'--tasks {task}; allowed in {self.name}: {", ".join(self.tasks)}')
+        jobs: dict[tuple[str, str, int], Job] = {}
+        for task in (name for name in self.tasks if name in tasks):
+            start = self.starts.get(task)
+            for seed, arm in product(seeds, arms):
+                before = jobs.get((start.task, arm.name, seed)) if start else None
+                given = (
+                    {**start.fields, 'init_from': str(before.folder)} if start and before else {}
+                )
+                values = {'recipe': 'best', **REPEATABLE, **self.settings[task], **given}
+                values |= {**overrides, **arm.changes, 'seed': seed}
+                rate = values.get('control_hz', DEFAULT_CONTROL_HZ)
+                config = recipe_config(task, **{**values, **steps_at_rate(values, rate)})
+                factors = {name: to_flat(config)[name] * by for name, by in arm.factors.items()}
+                folder = output / task / arm.name / f'seed{seed}'
+                job = Job(arm, changed(config, **factors), folder, before, episodes)
+                jobs[job.key] = job
+        return list(jobs.values())
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,7 +202,7 @@ class Job:
     @property
     def name(self) -> str:
         """Task, variant and seed as in the path of the folder."""
-        return run_name(*self.key)
+        return f'{self.config.task}/{self.arm.name}/seed{self.config.seed}'
 
     @property
     def has_checkpoint(self) -> bool:
@@ -184,11 +252,6 @@ class Job:
             )
 
 
-def run_name(task: str, arm: str, seed: int) -> str:
-    """Task, variant and seed as in the path of a run folder."""
-    return f'{task}/{arm}/seed{seed}'
-
-
 def to_settings(config: TrainConfig) -> dict[str, Any]:
     """Return a configuration as JSON values."""
     values: dict[str, Any] = json.loads(json.dumps(to_flat(config)))
@@ -212,63 +275,3 @@ def differing_fields(stored: Mapping[str, Any], config: TrainConfig) -> dict[str
         for name, value in before.items()
         if value != now[name] and name not in _MAY_DIFFER
     }
-
-
-def make_jobs(
-    task: str,
-    arms: Sequence[Arm],
-    seeds: Sequence[int],
-    values: Mapping[str, Any],
-    output: Path,
-    episodes: int = 0,
-) -> list[Job]:
-    """Return seed x variant, seed by seed, so that a stopped study has equally many seeds of each.
-
-    Args:
-        task: The task.
-        arms: The variants.
-        seeds: The seeds.
-        values: Common fields of `TrainConfig`, `recipe` among them.
-        output: Folder of all runs.
-        episodes: Fresh episodes that measure the last actor of each run.
-
-    Raises:
-        ValueError: If a value is not allowed.
-    """
-    jobs = []
-    for seed in seeds:
-        for arm in arms:
-            config = recipe_config(task, **_at_rate({**values, **arm.changes, 'seed': seed}))
-            factors = {name: to_flat(config)[name] * by for name, by in arm.factors.items()}
-            config = changed(config, **factors)
-            folder = output / task / arm.name / f'seed{seed}'
-            jobs.append(Job(arm, config, folder, final_episodes=episodes))
-    return jobs
-
-
-def _at_rate(values: dict[str, Any]) -> dict[str, Any]:
-    """Scale step counts to the action frequency: equal budgets in simulated time."""
-    return {**values, **steps_at_rate(values, values.get('control_hz', DEFAULT_CONTROL_HZ))}
-
-
-def research_jobs(
-    study: Study,
-    tasks: Sequence[str],
-    arms: Sequence[Arm],
-    seeds: Sequence[int],
-    overrides: Mapping[str, Any],
-    output: Path,
-    episodes: int = FINAL_EPISODES,
-) -> list[Job]:
-    """Return the runs of a study on some of its tasks; see `make_jobs`.
-
-    Raises:
-        ValueError: If a task or a value is not allowed.
-    """
-    jobs = []
-    for task in tasks:
-        if task not in study.settings:
-            raise ValueError(f'--tasks {task}; allowed in {study.name}: {", ".join(study.tasks)}')
-        values = {'recipe': 'best', **REPEATABLE, **study.settings[task], **overrides}
-        jobs += make_jobs(task, arms, seeds, values, output, episodes)
-    return jobs

@@ -9,7 +9,6 @@ import signal
 import sys
 import traceback
 from collections.abc import Callable, Sequence
-from enum import Enum
 from multiprocessing.connection import wait
 from multiprocessing.process import BaseProcess
 from pathlib import Path
@@ -31,34 +30,15 @@ from policy_node.training.studies.measures import measure_run
 from policy_node.training.studies.store import add_run, holds, read_runs
 from policy_node.training.studies.study import Job
 
+_NAME = 'fetch_hand_sim benchmark'
 LOG_FILE = 'log.txt'
 # Seconds between two lines about each running job.
 _STATUS_SECONDS = 600.0
 
 
-class Outcome(Enum):
-    """How a job ended; the value is the exit status of its process."""
-
-    FINISHED = EXIT_SUCCESS
-    FAILED = EXIT_FAILURE
-    TAKEN = 4
-    # Stopped by a signal, in the convention of shells.
-    HUNG_UP = 128 + signal.SIGHUP
-    INTERRUPTED = 128 + signal.SIGINT
-    TERMINATED = 128 + signal.SIGTERM
-
-    @property
-    def is_stopped(self) -> bool:
-        """True if a signal stopped the job."""
-        return self.value > 128
-
-
-class JobsStopped(KeyboardInterrupt):
-    """A signal stopped jobs."""
-
-    def __init__(self, outcome: Outcome) -> None:
-        super().__init__()
-        self.exit_code: int = outcome.value
+# Exit status of a job that another process trains. Others are those of the shell: 0, 1, and 128 +
+# number of the signal that stopped the job.
+TAKEN = 4
 
 
 class Place(Protocol):
@@ -71,8 +51,8 @@ class Place(Protocol):
         """Start a job; it may have ended when this returns."""
         ...
 
-    def wait(self) -> tuple[Job, Outcome]:
-        """Wait until one of the started jobs has ended."""
+    def wait(self) -> tuple[Job, int]:
+        """Wait until one of the started jobs has ended; return it and its exit status."""
         ...
 
 
@@ -86,47 +66,40 @@ def run_jobs(
     place: Place,
     report: Path,
     when_finished: Callable[[], object],
-) -> bool:
-    """Run all unfinished jobs, each after the job it starts from; return whether all finished.
+) -> int:
+    """Run all unfinished jobs, each after the job it starts from.
 
     Args:
         jobs: All jobs, the most important first.
         place: The place where they run.
+        when_finished: Renews the report; a failure does not end the running jobs.
 
-    Raises:
-        JobsStopped: If a signal stopped a job; no further job starts then.
+    Returns:
+        0 if all finished, 1 if not; if a signal stopped a job, 128 + its number. No further job
+        starts then.
     """
     waiting = [job for job in jobs if not is_finished(job, report)]
-    running, left = 0, len(waiting)
-    outcomes: list[Outcome] = []
+    running, left, stopped = 0, len(waiting), 0
     while True:
-        if not any(outcome.is_stopped for outcome in outcomes):
-            for job in [job for job in waiting if job.is_ready][: place.limit - running]:
-                _print(f'job {jobs.index(job) + 1} of {len(jobs)}: {job.name}')
-                waiting.remove(job)
-                place.start(job)
-                running += 1
+        ready = [] if stopped else [job for job in waiting if job.is_ready]
+        for job in ready[: place.limit - running]:
+            _print(f'job {jobs.index(job) + 1} of {len(jobs)}: {job.name}')
+            waiting.remove(job)
+            place.start(job)
+            running += 1
         if running == 0:
-            break
-        job, outcome = place.wait()
-        outcomes.append(outcome)
+            return stopped or (EXIT_FAILURE if left else EXIT_SUCCESS)
+        job, status = place.wait()
         running -= 1
-        if outcome is Outcome.FINISHED:
+        if status > 128:
+            stopped = stopped or status
+        elif status == EXIT_SUCCESS:
             left -= 1
             _print(f'{job.name} is finished; {left} to go')
-            _try_to_report(when_finished)
-    for outcome in outcomes:
-        if outcome.is_stopped:
-            raise JobsStopped(outcome)
-    return left == 0
-
-
-def _try_to_report(when_finished: Callable[[], object]) -> None:
-    """Renew the report; a failure does not end the running jobs."""
-    try:
-        when_finished()
-    except (CommandError, OSError, ValueError) as error:
-        complain('fetch_hand_sim benchmark', f'no report yet: {error}')
+            try:
+                when_finished()
+            except (CommandError, OSError, ValueError) as error:
+                complain(_NAME, f'no report yet: {error}')
 
 
 def _print(text: str) -> None:
@@ -135,17 +108,17 @@ def _print(text: str) -> None:
     print(text, flush=True)
 
 
-def attempt(job: Job, report: Path, command: str) -> Outcome:
-    """Train or continue a job in this process, measure it and store the measures."""
+def attempt(job: Job, report: Path, command: str) -> int:
+    """Train or continue a job, measure it, store the measures and return the exit status."""
     try:
         # Another process may have finished the job meanwhile.
         if is_finished(job, report):
-            return Outcome.FINISHED
+            return EXIT_SUCCESS
         if not job.is_trained:
             resume = job.has_checkpoint
             ending = train_run(job.config, job.folder, resume=resume, command=command)
             if ending.signal:
-                return Outcome(128 + ending.signal)
+                return 128 + ending.signal
             if not job.is_trained:
                 raise CommandError(f'training ended before the last step: {ending.reason}')
         with lock_run(job.folder):
@@ -153,15 +126,15 @@ def attempt(job: Job, report: Path, command: str) -> Outcome:
                 add_run(report, measure_run(job, command))
     except RunTakenError:
         _print(f'{job.name} is being trained by another process')
-        return Outcome.TAKEN
+        return TAKEN
     except (CommandError, TrainingError, OSError, ValueError) as error:
-        complain('fetch_hand_sim benchmark', f'{job.name}: {error}')
-        return Outcome.FAILED
+        complain(_NAME, f'{job.name}: {error}')
+        return EXIT_FAILURE
     except Exception:
         # The other jobs go on.
         traceback.print_exc()
-        return Outcome.FAILED
-    return Outcome.FINISHED
+        return EXIT_FAILURE
+    return EXIT_SUCCESS
 
 
 class ThisProcess:
@@ -170,13 +143,13 @@ class ThisProcess:
     def __init__(self, report: Path, command: str) -> None:
         self.limit = 1
         self._report, self._command = report, command
-        self._ended: list[tuple[Job, Outcome]] = []
+        self._ended: list[tuple[Job, int]] = []
 
     def start(self, job: Job) -> None:
         """Run the job."""
         self._ended.append((job, attempt(job, self._report, self._command)))
 
-    def wait(self) -> tuple[Job, Outcome]:
+    def wait(self) -> tuple[Job, int]:
         """Return the last job."""
         return self._ended.pop()
 
@@ -213,7 +186,7 @@ class Processes:
         del frame
         if not self._stopped_by:
             text = 'stopping; jobs finish their cycle and save their state; once more stops at once'
-            complain_from_handler('fetch_hand_sim benchmark', text)
+            complain_from_handler(_NAME, text)
             self._stopped_by = number
         for _, process in self._running.values():
             process.terminate()
@@ -227,7 +200,7 @@ class Processes:
         if self._stopped_by:
             process.terminate()
 
-    def wait(self) -> tuple[Job, Outcome]:
+    def wait(self) -> tuple[Job, int]:
         """Wait for one of the processes."""
         while not (ended := wait(list(self._running), timeout=_STATUS_SECONDS)):
             for job, _ in self._running.values():
@@ -236,18 +209,18 @@ class Processes:
         assert isinstance(sentinel, int)
         job, process = self._running.pop(sentinel)
         process.join()
-        codes = {outcome.value: outcome for outcome in Outcome}
-        # A signal before the training installed its handler.
-        codes[-signal.SIGTERM] = Outcome.TERMINATED
-        outcome = codes.get(process.exitcode or 0, Outcome.FAILED)
-        if outcome.is_stopped and self._stopped_by:
+        status = process.exitcode or EXIT_SUCCESS
+        if status == -signal.SIGTERM:
+            # Before the training installed its handler.
+            status = 128 + signal.SIGTERM
+        if status > 128 and self._stopped_by:
             # Every signal was passed on as SIGTERM.
-            outcome = Outcome(128 + self._stopped_by)
-        if outcome is Outcome.FAILED:
-            complain('fetch_hand_sim benchmark', f'{job.name} failed; see {job.folder / LOG_FILE}')
-        elif outcome is Outcome.TAKEN:
+            status = 128 + self._stopped_by
+        if status == TAKEN:
             _print(f'{job.name} is being trained by another process')
-        return job, outcome
+        elif status != EXIT_SUCCESS and status < 128:
+            complain(_NAME, f'{job.name} failed; see {job.folder / LOG_FILE}')
+        return job, status
 
 
 def _work(job: Job, report: Path, command: str) -> None:
@@ -262,7 +235,7 @@ def _work(job: Job, report: Path, command: str) -> None:
     with (job.folder / LOG_FILE).open('a') as log:
         os.dup2(log.fileno(), sys.stdout.fileno())
         os.dup2(log.fileno(), sys.stderr.fileno())
-    sys.exit(attempt(job, report, command).value)
+    sys.exit(attempt(job, report, command))
 
 
 class Ray:
@@ -289,12 +262,12 @@ class Ray:
         remote = self._attempt.options(num_cpus=cores)
         self._running[remote.remote(absolute, self._report, self._command)] = job
 
-    def wait(self) -> tuple[Job, Outcome]:
+    def wait(self) -> tuple[Job, int]:
         """Wait for one of the jobs."""
         (done, *_), _ = self._ray.wait(list(self._running))
         job = self._running.pop(done)
         try:
             return job, self._ray.get(done)
         except self._ray.exceptions.RayError as error:
-            complain('fetch_hand_sim benchmark', f'{job.name}: {error}')
-            return job, Outcome.FAILED
+            complain(_NAME, f'{job.name}: {error}')
+            return job, EXIT_FAILURE

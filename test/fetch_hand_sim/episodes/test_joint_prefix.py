@@ -19,7 +19,7 @@ from msgs_spec.robots import JOINT_PREFIX
 from msgs_spec.schemas import deserialize
 from msgs_spec.tasks import TASKS, task_spec
 from msgs_spec.tick import EpisodeStatus, TickEncoder
-from policy_node.node.responder import Commander, Responder
+from policy_node.node.responder import Responder
 from policy_node.policies.loading import load_policy
 
 TICKS = 5
@@ -98,8 +98,7 @@ def test_a_policy_answers_a_robot_with_renamed_joints(task, simulations):
         sent.append(data)
         return True
 
-    commander = Commander(load_policy('resting', task), 25.0)
-    responder = Responder(commander, runner.waiting_status(), send)
+    responder = Responder(load_policy('resting', task), runner.waiting_status(), send)
     messages = TickEncoder(runner.spec).encode(runner.advance(runner.resting_command()))
     for spec, data in messages:
         if spec.name in {source.name for source in responder.topics}:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,14 +11,13 @@ import pytest
 from fetch_hand_sim.episodes.runner import FIRST_STAMP_NS, EpisodeRunner
 from fetch_hand_sim.simulation import Simulation
 from msgs_spec.codecs import TopicCodec, answered_stamp, decode
-from msgs_spec.robots import command_from_action
 from msgs_spec.schemas import deserialize, serialize
 from msgs_spec.tasks import task_spec
 from msgs_spec.tick import TickEncoder
 from msgs_spec.topics import topic
 from node_runtime.diagnostics import Level, Report, encode_reports
 from policy_node.node.health import Health, Pace, read_pace
-from policy_node.node.responder import Commander, Responder, StampJoin
+from policy_node.node.responder import Responder, StampJoin
 from policy_node.policies.loading import load_policy
 from policy_node.policies.policy import LoadedPolicy
 
@@ -25,7 +25,7 @@ REACH = task_spec('FetchReach')
 
 
 def resting():
-    return Commander(load_policy('resting', 'FetchReach'), 25.0)
+    return load_policy('resting', 'FetchReach')
 
 
 class Wire:
@@ -180,18 +180,10 @@ def test_an_earlier_stamp_is_late_only_for_a_while():
     assert join.add('a', 1_040_000_000, np.zeros(1)) is not None
 
 
-def test_random_commands_are_valid_and_start_alike():
-    first, second = (Commander(load_policy('random', 'HandReach'), 25.0) for _ in range(2))
-    commands = [first.command({'observation': np.zeros(63)}) for _ in range(3)]
-    again = [second.command({'observation': np.zeros(63)}) for _ in range(3)]
-    assert [c.tolist() for c in commands] == [c.tolist() for c in again]
-    low, high = (command_from_action(first.spec.robot, np.full(20, x)) for x in (-1.0, 1.0))
-    assert all(((c >= low) & (c <= high)).all() for c in commands)
-
-
-def test_a_policy_of_another_rate_is_refused():
+def test_a_policy_of_another_rate_is_refused(episode):
+    status = replace(episode[0], control_hz=50.0)
     with pytest.raises(ValueError, match='25 Hz; the robot runs at 50 Hz'):
-        Commander(load_policy('FetchReach'), 50.0)
+        Responder(load_policy('FetchReach'), status, Wire())
 
 
 @pytest.mark.parametrize(
@@ -202,9 +194,9 @@ def test_an_invalid_action_is_one_line(answer):
         def predict(self, observation, *, deterministic=True):
             return answer, None
 
-    strange = Commander(LoadedPolicy(Strange(), 'FetchReach', 'actor strange.onnx'), 25.0)
+    strange = LoadedPolicy(Strange(), 'FetchReach', 'actor strange.onnx')
     with pytest.raises(ValueError, match=r'actor strange.onnx '):
-        strange.command({'observation': np.zeros(10)})
+        strange.predict({'observation': np.zeros(10)})
 
 
 def test_a_policy_that_fails_once_answers_the_next_tick(case, episode):
@@ -218,7 +210,7 @@ def test_a_policy_that_fails_once_answers_the_next_tick(case, episode):
             return np.zeros(4), None
 
     _, wire, ticks = case
-    moody = Commander(LoadedPolicy(Moody(), 'FetchReach', 'actor moody.onnx'), 25.0)
+    moody = LoadedPolicy(Moody(), 'FetchReach', 'actor moody.onnx')
     now = [7.0]
     responder = Responder(moody, episode[0], wire, lambda: now[0])
     with pytest.raises(ValueError, match=r'moody.onnx .*INVALID_ARGUMENT: a node of'):
@@ -421,8 +413,8 @@ def test_robots_of_other_namespaces_are_reported_without_a_robot_here():
 def test_a_policy_is_reset_between_episodes(status_first: bool) -> None:
     """After the first tick of an episode the memory contains only this tick."""
     runner = EpisodeRunner(Simulation('FetchReach', num_threads=1))
-    encoder, commander = TickEncoder(REACH), Commander(load_policy('FetchReach_robust'), 25.0)
-    responder = Responder(commander, runner.waiting_status(), Wire())
+    encoder = TickEncoder(REACH)
+    responder = Responder(load_policy('FetchReach_robust'), runner.waiting_status(), Wire())
 
     def play(phase_is_told: bool) -> None:
         tick = runner.advance(np.full(4, 0.1))
@@ -435,9 +427,9 @@ def test_a_policy_is_reset_between_episodes(status_first: bool) -> None:
 
     for _ in range(5):
         play(phase_is_told=True)
-    assert np.count_nonzero(commander._state) == 16
+    assert np.count_nonzero(responder._state) == 16
     runner.end_episode()
     play(phase_is_told=True)
-    assert np.count_nonzero(commander._state) == 4
+    assert np.count_nonzero(responder._state) == 4
     play(phase_is_told=True)
-    assert np.count_nonzero(commander._state) == 8
+    assert np.count_nonzero(responder._state) == 8

@@ -2,17 +2,11 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
 
-from policy_node import load_actor
 from policy_node.policies.actor import Actor, Normalizer
-from policy_node.policies.loading import actor_path, shipped_actors
 from policy_node.policies.network_shape import NetworkShape
 
 SHAPE = NetworkShape(observation_size=10, goal_size=3, action_size=4, hidden_sizes=(16, 16))
@@ -64,43 +58,9 @@ def test_predict_is_the_network_written_out() -> None:
     np.testing.assert_allclose(action, layer, atol=1e-5)
 
 
-def test_layer_norm_changes_the_function_and_the_parameters() -> None:
-    plain, normalized = make_actor(), make_actor(layer_norm=True)
-    assert any(isinstance(module, torch.nn.LayerNorm) for module in normalized.modules())
-    assert len(normalized.state_dict()) == len(plain.state_dict()) + 4
-
-
 def test_predict_rejects_missing_parts_and_wrong_shapes() -> None:
     actor, observation = make_actor(), make_observation(2)
     with pytest.raises(ValueError, match="'desired_goal'"):
         actor.predict({k: v for k, v in observation.items() if k != 'desired_goal'})
     with pytest.raises(ValueError, match=r'\(2, 9\)'):
         actor.predict({**observation, 'observation': observation['observation'][:, :9]})
-
-
-def test_an_unknown_actor_is_refused_with_the_names_of_the_shipped(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"'FetchFly'.*FetchReach") as caught:
-        load_actor('FetchFly')
-    assert '\n' not in str(caught.value)
-    with pytest.raises(ValueError, match='no actor'):
-        load_actor(tmp_path)
-
-
-def test_every_shipped_actor_loads_and_is_bounded() -> None:
-    assert 'FetchReach' in shipped_actors()
-    for name, path in shipped_actors().items():
-        assert actor_path(name) == path
-        actor = load_actor(name, task=name.removesuffix('_robust'))
-        observation = {
-            'observation': np.full((3, actor.shape.observation_size), 1e6),
-            'desired_goal': np.zeros((3, actor.shape.goal_size)),
-        }
-        action, _ = actor.predict(observation)
-        assert action.shape == (3, actor.shape.action_size)
-        assert (np.abs(action) <= 1.0).all()
-
-
-def test_importing_the_package_does_not_load_torch() -> None:
-    code = 'import sys, policy_node; assert "torch" not in sys.modules; policy_node.load_actor'
-    result = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True)
-    assert result.returncode == 0, result.stderr

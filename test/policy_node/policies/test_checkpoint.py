@@ -88,10 +88,6 @@ def assert_refused(path: Path, match: str, task: str | None = None) -> None:
     assert str(path) in str(caught.value)
 
 
-def test_another_task_is_refused(saved: Path) -> None:
-    assert_refused(saved, 'FetchPush, not on FetchSlide', task='FetchSlide')
-
-
 def test_invalid_safetensors_files_are_rejected(tmp_path: Path) -> None:
     path = tmp_path / 'actor.safetensors'
     path.write_bytes(pickle.dumps({'weights': [1, 2, 3]}))

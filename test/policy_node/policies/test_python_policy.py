@@ -10,7 +10,6 @@ import pytest
 
 from msgs_spec.tasks import task_spec
 from policy_node import load_policy
-from policy_node.node.responder import Commander
 from policy_node.training.evaluate_policy import main as evaluate
 from support.fresh_actor import observations
 
@@ -97,7 +96,7 @@ def test_an_object_acts_with_its_predict(module: str) -> None:
     action, _ = found.policy.predict(observations(task_spec('FetchReach'), 3))
     assert action.tolist() == np.full((3, 4), 0.25).tolist()
     with pytest.raises(ValueError, match='50 Hz; the robot runs at 25 Hz'):
-        Commander(found, 25.0)
+        found.require_rate(25.0)
 
 
 def test_a_function_answers_one_observation_and_batches_row_by_row(module: str) -> None:

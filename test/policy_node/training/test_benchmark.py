@@ -29,7 +29,6 @@ from policy_node.training.runs.training_state import (
 from policy_node.training.studies.command import jobs_from_arguments, main, parse_arguments
 from policy_node.training.studies.measures import Curve
 from policy_node.training.studies.report import aggregate, draw
-from policy_node.training.studies.store import read_runs
 from policy_node.training.studies.workers import is_finished
 
 torch.set_num_threads(1)
@@ -94,31 +93,6 @@ def test_curves_without_a_common_step_are_drawn_as_nothing() -> None:
     assert band.env_steps.size == 0
     picture = draw({'FetchReach': {'her_sparse': band}}, {'her_sparse': 'DDPG+HER, sparse'})
     assert picture.startswith(b'\x89PNG')
-
-
-@pytest.mark.release
-def test_a_benchmark_runs_reports_and_is_not_run_again(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    arguments = small(tmp_path / 'runs', '--arms', 'her_sparse', 'ddpg_dense')
-    arguments += ['--report', str(tmp_path / 'report')]
-    assert main(arguments) == 0
-    printed = capsys.readouterr().out
-    assert 'job 2 of 2: FetchReach/ddpg_dense/seed0' in printed
-    report = tmp_path / 'report'
-    assert (report / 'figure.png').read_bytes()[:4] == b'\x89PNG'
-    assert '`her_sparse`: DDPG+HER, sparse | 1 |' in (report / 'README.md').read_text()
-    runs = list(read_runs(report).values())
-    assert all(
-        run['command'].startswith('fetch_hand_sim benchmark --seeds 0 --steps 1200') for run in runs
-    )
-    assert [[steps for steps, _ in run['curve']] for run in runs] == [[400, 800, 1200]] * 2
-    logs = sorted((tmp_path / 'runs').rglob('progress.csv'))
-    assert len(logs) == 2
-    before = [path.read_bytes() for path in logs]
-    assert main(arguments) == 0
-    assert 'job ' not in capsys.readouterr().out
-    assert [path.read_bytes() for path in logs] == before
 
 
 @pytest.mark.release
@@ -234,7 +208,7 @@ def test_another_budget_in_the_same_folder_is_refused(
             ['--steps', '9', '--set', 'total_steps=8'],
             '--steps 9 excludes --set total_steps=8',
         ),
-        (['--study', 'best', '--arms', 'her_sparse'], '--arms does not belong to --study best'),
+        (['--study', 'best', '--arms', 'her_sparse'], "'her_sparse'; allowed in best: best"),
         (['--study', 'goals', '--actors', 'x'], '--actors belongs to --study best'),
         (['--set', 'init_from=FetchReach'], '--set init_from is not possible'),
         (['--set', 'time_limit=2'], '--set time_limit is not possible: a job ends when its steps'),

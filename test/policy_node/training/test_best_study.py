@@ -21,11 +21,11 @@ from policy_node.training.configuration.recipes import recipe_config
 from policy_node.training.runs.initial_networks import steps_behind
 from policy_node.training.runs.run_log import read_progress
 from policy_node.training.runs.training_state import Counters, TrainingState, state_bytes
-from policy_node.training.studies.best import BEST_ORDER, STARTS_FROM, start_from
+from policy_node.training.studies.best import BEST
 from policy_node.training.studies.command import jobs_from_arguments, main, parse_arguments
 from policy_node.training.studies.store import add_run
 from policy_node.training.studies.study import Job, to_settings
-from policy_node.training.studies.workers import LOG_FILE, Outcome, run_jobs
+from policy_node.training.studies.workers import LOG_FILE, run_jobs
 
 torch.set_num_threads(1)
 
@@ -48,9 +48,9 @@ def test_every_task_is_trained_with_its_best_recipe_after_what_it_starts_from(
     jobs = jobs_of('--output', str(tmp_path))
     assert {job.config.task for job in jobs} == set(TASKS) and len(jobs) == len(TASKS)
     for number, job in enumerate(jobs):
-        start = STARTS_FROM.get(job.config.task)
-        folder = str(tmp_path / start / 'best' / 'seed0') if start else ''
-        chained = start_from(job.config.task, folder) if start else {}
+        start = BEST.starts.get(job.config.task)
+        folder = str(tmp_path / start.task / 'best' / 'seed0') if start else ''
+        chained = {**start.fields, 'init_from': folder} if start else {}
         threads = {'simulation_threads': 1, 'torch_threads': 1}
         assert job.config == recipe_config(job.config.task, 'best', **threads, **chained)
         assert job.is_ready == (start is None)
@@ -58,7 +58,7 @@ def test_every_task_is_trained_with_its_best_recipe_after_what_it_starts_from(
         assert (to_flat(job.config)['first_distance'] > 1.0) == gains_position
         if start:
             assert job.config.init_from == folder and job.config.learning_starts > 0
-            assert job.after in jobs[:number] and job.after.config.task == start
+            assert job.after in jobs[:number] and job.after.config.task == start.task
 
 
 def test_a_task_alone_starts_from_nothing(tmp_path: Path) -> None:
@@ -93,10 +93,10 @@ class Recorder:
         self.running.append(job)
         self.most = max(self.most, len(self.running))
 
-    def wait(self) -> tuple[Job, Outcome]:
+    def wait(self) -> tuple[Job, int]:
         job = self.running.pop(0)
         if job.config.task in self.failing:
-            return job, Outcome.FAILED
+            return job, 1
         job.folder.mkdir(parents=True)
         counters = Counters(env_steps=job.config.total_steps)
         state = TrainingState({}, counters, {'config': {}})
@@ -104,28 +104,28 @@ class Recorder:
         task, arm, seed = job.key
         run = {'task': task, 'arm': arm, 'seed': seed, 'final_episodes': 0}
         add_run(self.report, {**run, 'config': to_settings(job.config)})
-        return job, Outcome.FINISHED
+        return job, 0
 
 
 def test_jobs_run_as_many_at_once_as_allowed_and_after_what_they_need(tmp_path: Path) -> None:
     place = Recorder(tmp_path, limit=3)
-    assert run_jobs(jobs_of('--output', str(tmp_path)), place, tmp_path, nothing)
+    assert run_jobs(jobs_of('--output', str(tmp_path)), place, tmp_path, nothing) == 0
     assert place.most == 3 and sorted(place.order) == sorted(TASKS)
-    for task, start in STARTS_FROM.items():
-        assert place.order.index(start) < place.order.index(task)
+    for task, start in BEST.starts.items():
+        assert place.order.index(start.task) < place.order.index(task)
 
 
 def test_a_job_that_fails_stops_only_what_starts_from_it(tmp_path: Path) -> None:
     place = Recorder(tmp_path, limit=2, failing=('HandManipulateBlockRotateXYZ',))
     jobs = jobs_of('--output', str(tmp_path))
-    assert not run_jobs(jobs, place, tmp_path, nothing)
+    assert run_jobs(jobs, place, tmp_path, nothing) == 1
     lost: set[str] = set()
-    for task in BEST_ORDER:
-        if STARTS_FROM.get(task) in lost | set(place.failing):
+    for task in BEST.tasks:
+        if task in BEST.starts and BEST.starts[task].task in lost | set(place.failing):
             lost.add(task)
     assert set(place.order) == set(TASKS) - lost
     again = Recorder(tmp_path, limit=2)
-    assert run_jobs(jobs, again, tmp_path, nothing)
+    assert run_jobs(jobs, again, tmp_path, nothing) == 0
     assert set(again.order) == lost | set(place.failing)
 
 
@@ -136,7 +136,7 @@ def test_a_report_that_cannot_be_written_ends_no_job(
         raise OSError(28, 'No space left on device', 'runs.csv')
 
     place = Recorder(tmp_path, limit=2)
-    assert run_jobs(jobs_of('--output', str(tmp_path)), place, tmp_path, full)
+    assert run_jobs(jobs_of('--output', str(tmp_path)), place, tmp_path, full) == 0
     assert sorted(place.order) == sorted(TASKS)
     assert (
         "fetch_hand_sim benchmark: no report yet: [Errno 28] No space left on device: 'runs.csv'"

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -14,7 +12,7 @@ from policy_node.training.configuration.config import Critics
 from policy_node.training.experience.replay import Transitions
 from policy_node.training.learners.ddpg import DDPG
 from policy_node.training.research.critics import AGGREGATES, Ensemble, critic_loss
-from policy_node.training.research.judged import Judge
+from policy_node.training.research.judged import bellman, uncertain
 from support.learners import SHAPE, make_learner
 
 torch.set_num_threads(1)
@@ -83,19 +81,6 @@ def test_without_target_networks_there_are_none_to_move() -> None:
     learner.update(chain_batch(64, np.random.default_rng(0)))
 
 
-def test_disagreement_is_where_nothing_was_learnt() -> None:
-    learner = make_learner(critics=3, target='none')
-    generator = np.random.default_rng(0)
-    for _ in range(300):
-        learner.update(chain_batch(64, generator))
-    known = chain_batch(64, generator)
-    elsewhere = np.full((64, 1), -40.0, np.float32)
-    unknown = replace(known, goal=elsewhere)
-    judge = Judge(learner)
-    assert judge.uncertain(known).mean() < 0.05 < judge.uncertain(unknown).mean()
-    assert judge.bellman(known).mean() < 0.05 and judge.bellman(known).shape == (64,)
-
-
 # Of observation, goal and action: what the critics are, and what their slow copies are.
 CRITICS = np.array([[0.5, -0.3, 0.2, -0.4], [-0.4, 0.1, 0.6, -1.1], [0.2, 0.8, -0.7, -0.9]])
 SLOW = np.array([[0.8, 0.5, -0.6, -1.2], [0.9, -0.5, 0.4, -1.0], [-0.8, 0.6, 0.1, -0.4]])
@@ -152,14 +137,14 @@ def test_surprise_is_how_far_a_value_is_from_its_clipped_target() -> None:
     value, following = values_by_hand(1, batch)
     target = np.clip(batch.reward + batch.discount * following[0], -2.0, 0.0)
     assert (target == -2.0).any() and (target == 0.0).any(), 'both limits matter'
-    found = Judge(linear_learner(1)).bellman(batch)
+    found = bellman(linear_learner(1), batch)
     np.testing.assert_allclose(found, np.abs(value[0] - target), atol=1e-5)
 
 
 def test_disagreement_is_the_deviation_of_values_over_critics() -> None:
     batch = scattered()
     value, _ = values_by_hand(3, batch)
-    found = Judge(linear_learner(3)).uncertain(batch)
+    found = uncertain(linear_learner(3), batch)
     np.testing.assert_allclose(found, value.std(axis=0, ddof=1), atol=1e-5)
 
 

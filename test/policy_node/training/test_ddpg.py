@@ -13,7 +13,7 @@ from policy_node.policies.network_shape import NetworkShape
 from policy_node.training.configuration.recipes import recipe_config
 from policy_node.training.experience.replay import Transitions
 from policy_node.training.machine import Workers, choose_device, uses_bfloat16
-from policy_node.training.research.judged import Judge
+from policy_node.training.research.judged import SCORES
 from policy_node.training.research.registry import make_ddpg
 from support import learners
 
@@ -200,7 +200,7 @@ def test_goals_are_judged_as_precisely_as_values_are_learnt(name):
     judged = {}
     for precision in ('float32', 'bfloat16'):
         learner = make_learner(precision=precision, critics=2)
-        judged[precision] = getattr(Judge(learner), name)(make_batch())
+        judged[precision] = SCORES[name](learner, make_batch())
         assert judged[precision].dtype == np.float32
     assert not np.array_equal(judged['float32'], judged['bfloat16'])
     np.testing.assert_allclose(judged['bfloat16'], judged['float32'], atol=0.02)

@@ -16,7 +16,6 @@ from policy_node.training.experience.replay import Episodes, Starts, Transitions
 from policy_node.training.learners.ddpg import DDPG
 from policy_node.training.machine import Workers
 from policy_node.training.research.frequent_actions import (
-    Holder,
     HoldingSampler,
     ParameterNoise,
     length_of,
@@ -140,27 +139,6 @@ def test_lengths_mean_ticks_and_ticks_lengths() -> None:
     ticks = np.arange(1, 11)
     np.testing.assert_array_equal(ticks_of(length_of(ticks, 10), 10), ticks)
     np.testing.assert_array_equal(ticks_of(np.array([-1.0, 0.01, 1.0]), 3), [1, 2, 3])
-
-
-def test_an_action_holds_for_its_length_but_not_beyond_the_episode() -> None:
-    holder = Holder(most=4)
-    wanted = np.array([[3, 1], [1, 9], [9, 2], [2, 9], [4, 9]])  # ticks; 9 is not looked at
-    numbers = np.arange(5.0)[:, None] * [1.0, 10.0]
-    held = [
-        holder.take(
-            np.stack([numbers[i], length_of(np.minimum(wanted[i], 4), 4)], axis=1).astype(
-                np.float32
-            ),
-            ticks_left=5 - i,
-        )
-        for i in range(5)
-    ]
-    # The first robot decides at 0 (for 3) and 3 (for 2), the second at 0, 1 (for 4).
-    np.testing.assert_array_equal(
-        np.stack(held)[:, :, 0], [[0, 0], [0, 10], [0, 10], [3, 10], [3, 10]]
-    )
-    left = ticks_of(np.stack(held)[:, :, 1], 4)
-    np.testing.assert_array_equal(left, [[3, 1], [2, 4], [1, 3], [2, 2], [1, 1]])
 
 
 @pytest.mark.parametrize('noise', [0.0, 0.3])

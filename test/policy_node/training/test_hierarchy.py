@@ -14,7 +14,7 @@ from policy_node.policies.files import read_tensors
 from policy_node.policies.network_shape import NORMALIZED_CLIP, NetworkShape
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.recipes import recipe_config
-from policy_node.training.experience.replay import Episodes, Transitions
+from policy_node.training.experience.replay import Episodes
 from policy_node.training.experience.sampling import TransitionSampler
 from policy_node.training.machine import Workers
 from policy_node.training.research.hierarchy import (
@@ -24,7 +24,6 @@ from policy_node.training.research.hierarchy import (
     HierarchicalDDPG,
     HierarchicalExperience,
     SubgoalSampler,
-    subgoal_columns,
 )
 from policy_node.training.runs.run_log import RunLog, read_progress
 from policy_node.training.runs.trainer import Trainer
@@ -74,7 +73,9 @@ def proposals(tested: float, updates: int) -> np.ndarray:
     config, generator = configured(gamma=0.95), make_generator()
     learner = HierarchicalDDPG(SHAPE, config, CPU, Workers())
     learner.actor.goal_normalizer.std.fill_(1.0 / NORMALIZED_CLIP)
-    sampler = SubgoalSampler(TransitionSampler(reached, 0.95), 10, config.lowest_value)
+    sampler = SubgoalSampler(
+        compute_reward=reached, gamma=0.95, most_steps=10, missed_value=config.lowest_value
+    )
     episodes = walks(2_000, tested, generator)
     mixture = {'future': 0.8, 'actual': 0.2}
     for _ in range(updates):
@@ -133,9 +134,9 @@ def test_both_levels_learn_a_line_together() -> None:
     config, line, generator = configured(**changes), Line(32), make_generator()
     learner = HierarchicalDDPG(SHAPE, config, CPU, Workers())
     sampler = TransitionSampler(reached, config.tick_gamma, sources=LOW_SOURCES)
-    parts = Workers(), sampler, generator, subgoal_columns(1)
+    parts = Workers(), sampler, generator, 2
     experience = HierarchicalExperience(config, line.spec, *parts)
-    collector = GuidedCollector(line, [0] * 32, config, 10)
+    collector = GuidedCollector(line, [0] * 32, config)
     for cycle in range(20):
         policy = learner.acting_policy()
         assert isinstance(policy, GuidedPolicy) == (cycle > 0), 'no proposals before learning'
@@ -154,13 +155,6 @@ def test_both_levels_learn_a_line_together() -> None:
             result = line.step(policy.predict(observation)[0])
             observation = result.observation
         assert result.success.mean() > 0.9
-
-
-def test_two_levels_refuse_transitions_of_one() -> None:
-    learner = HierarchicalDDPG(SHAPE, configured(), CPU, Workers())
-    one = np.zeros((1, 1), np.float32)
-    with pytest.raises(TypeError, match='HierarchicalTransitions'):
-        learner.update(Transitions(one, one, one, one, one[0], one[0]))
 
 
 SMALL = {'num_envs': 8, 'updates_per_cycle': 4, 'batch_size': 64, 'evaluation_episodes': 8}

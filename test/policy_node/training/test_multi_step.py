@@ -9,7 +9,7 @@ from fetch_hand_sim.simulation.rewards import GoalMetric
 from msgs_spec.tasks import task_spec
 from policy_node.training.experience.replay import Episodes
 from policy_node.training.experience.sampling import TransitionSampler
-from policy_node.training.research.conditions import ConditionedSampler, Threshold
+from policy_node.training.research.conditions import ThresholdSampler
 from policy_node.training.research.frequent_actions import HoldingSampler, length_of
 from policy_node.training.research.hierarchy import SubgoalSampler
 from policy_node.training.research.judged import CuttingSampler, LambdaSampler
@@ -100,8 +100,12 @@ def test_a_reward_for_a_share_of_time_is_that_share_at_every_step(episodes):
 
 
 @pytest.mark.parametrize('every', [2, 4, TICKS])
-def test_every_tick_of_a_subgoal_is_rewarded_for_the_goal_of_its_row(episodes, every):
-    sampler = SubgoalSampler(TransitionSampler(nearness, 0.9), every, missed_value=-50.0)
+def test_every_tick_of_a_subgoal_is_rewarded_for_the_goal_of_its_row(
+    episodes: Episodes, every: int
+) -> None:
+    sampler = SubgoalSampler(
+        compute_reward=nearness, gamma=0.9, most_steps=every, missed_value=-50.0
+    )
     episodes.action[..., 4] = 0.0
     batch = sampler.sample(episodes, ROW, MIXTURE, np.random.default_rng(2))
     assert set(steps_of(batch)) == {every}
@@ -111,11 +115,11 @@ def test_every_tick_of_a_subgoal_is_rewarded_for_the_goal_of_its_row(episodes, e
 @pytest.mark.parametrize('n_step', [1, 3, 100])
 def test_the_threshold_of_a_row_holds_at_every_step_of_its_return(episodes, n_step):
     spec = task_spec('FetchReach')
-    condition = Threshold(GoalMetric(spec), widest=4.0)
-    sampler = ConditionedSampler(nearness, 0.9, n_step, condition=condition)
+    sampler = ThresholdSampler(nearness, 0.9, n_step, metric=GoalMetric(spec), widest=4.0)
     batch = sampler.sample(episodes, ROW, MIXTURE, np.random.default_rng(2))
     near = spec.distance_threshold * np.exp(batch.condition[:, 0].astype(float))
     assert 0.02 < near.min() < 0.03 and 0.15 < near.max() < 0.2
+    assert np.median(near) == pytest.approx(0.05 * 2**0.5, abs=0.01), 'log-uniform'
 
     def met(index, achieved, goal):
         return float(np.linalg.norm(achieved - goal) < near[index]) - 1.0

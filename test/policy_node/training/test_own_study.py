@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from policy_node.training.studies.command import find_study, main, parse_arguments
+from policy_node.training.studies.command import main, parse_arguments
 from policy_node.training.studies.store import read_runs
 
 torch.set_num_threads(1)
@@ -22,7 +22,10 @@ def module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     """Its name; the working directory has it."""
     (example,) = re.findall(r'```python\n(.*?)```', PAGE.read_text(), re.DOTALL)
     name = f'studies_of_{tmp_path.name}'.replace('-', '_')
-    (tmp_path / f'{name}.py').write_text(f'{example}\nFAILS = 3\n')
+    (tmp_path / f'{name}.py').write_text(
+        f'{example}\nFAILS = 3\n'
+        + example.replace('WIDTHS', 'TAKEN').replace("'widths'", "'values'")
+    )
     monkeypatch.chdir(tmp_path)
     return name
 
@@ -46,6 +49,7 @@ def test_columns_of_the_tables_are_explained() -> None:
     ('name', 'line'),
     [
         ('{}:FAILS', ':FAILS is a int; allowed: a Study'),
+        ('{}:TAKEN', "is called 'values'; allowed: a word that no other study is"),
         ('{}:OTHER', ":OTHER: AttributeError: module '"),
         ('nowhere_at_all:STUDY', "ModuleNotFoundError: No module named 'nowhere_at_all'"),
         ('gaols', "'gaols' given; allowed: paper, goals, "),
@@ -59,10 +63,3 @@ def test_what_is_no_study_is_refused(
         parse_arguments(['--study', name.format(module)])
     error = capsys.readouterr().err
     assert ended.value.code == 2 and line in error and error.count('\n') == 1
-
-
-def test_a_study_needs_a_name_of_its_own(module: str, tmp_path: Path) -> None:
-    file = tmp_path / f'{module}.py'
-    file.write_text(file.read_text().replace("name='widths'", "name='values'"))
-    with pytest.raises(ValueError, match="is called 'values'; allowed: a word that no other"):
-        find_study(f'{module}:WIDTHS')

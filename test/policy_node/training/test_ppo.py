@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -16,16 +17,14 @@ from msgs_spec.tasks import task_spec
 from policy_node.policies.network_shape import NetworkShape
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.recipes import recipe_config
-from policy_node.training.experience.replay import Episodes
+from policy_node.training.experience.replay import Episodes, Starts
 from policy_node.training.experience.sampling import TransitionSampler
 from policy_node.training.machine import Workers
-from policy_node.training.research.ppo import PPO, log_probability
+from policy_node.training.research.ppo import PPO, RolloutTransitions, log_probability
 from policy_node.training.research.registry import make_learner
 from policy_node.training.research.rollouts import (
     Outcomes,
     RolloutMaker,
-    Rollouts,
-    RolloutTransitions,
     advantages,
     decision_weights,
     goals_in_hindsight,
@@ -43,21 +42,6 @@ def configured(**changes: object) -> TrainConfig:
     return recipe_config('FetchReach', 'best', **{**ON_POLICY, **changes})
 
 
-@pytest.mark.parametrize('mean', [-1.0, -0.3, 0.9])
-def test_densities_are_those_of_noisy_actions_that_were_clipped(mean: float) -> None:
-    def density(action: float) -> float:
-        point = torch.tensor([action], dtype=torch.float64)
-        return math.exp(float(log_probability(torch.tensor([mean]).double(), 0.4, point)))
-
-    generator = np.random.default_rng(0)
-    drawn = (mean + 0.4 * generator.standard_normal(200_000)).clip(-1.0, 1.0)
-    assert density(-1.0) == pytest.approx((drawn == -1.0).mean(), abs=0.005)
-    assert density(1.0) == pytest.approx((drawn == 1.0).mean(), abs=0.005)
-    inner = np.linspace(-1.0, 1.0, 401)[1:-1]
-    between = np.mean([density(float(action)) for action in inner]) * 2.0
-    assert density(-1.0) + between + density(1.0) == pytest.approx(1.0, abs=0.01)
-
-
 def test_densities_of_several_parts_multiply_and_have_gradients_beyond_the_limits() -> None:
     mean = torch.tensor([[0.2, 5.0]], requires_grad=True)
     action = torch.tensor([[0.5, -1.0]])
@@ -67,22 +51,6 @@ def test_densities_of_several_parts_multiply_and_have_gradients_beyond_the_limit
     (gradient,) = torch.autograd.grad(both.sum(), mean)
     assert torch.isfinite(both).all() and torch.isfinite(gradient).all()
     assert gradient[0, 0] > 0 > gradient[0, 1]
-
-
-def test_advantages_are_discounted_sums_of_errors() -> None:
-    generator = np.random.default_rng(0)
-    reward, value = generator.normal(size=(3, 6)), generator.normal(size=(3, 7))
-    found = advantages(reward, value, gamma=0.9, trace=0.7)
-    for tick in range(6):
-        expected = sum(
-            0.63 ** (later - tick)
-            * (reward[:, later] + 0.9 * value[:, later + 1] - value[:, later])
-            for later in range(tick, 6)
-        )
-        np.testing.assert_allclose(found[:, tick], expected)
-    to_the_end = advantages(reward, value, gamma=0.9, trace=1.0)[:, 0] + value[:, 0]
-    returns = sum(0.9**t * reward[:, t] for t in range(6)) + 0.9**6 * value[:, 6]
-    np.testing.assert_allclose(to_the_end, returns)
 
 
 def test_weights_make_actions_for_one_goal_those_for_another() -> None:
@@ -150,7 +118,7 @@ def test_replayed_episodes_are_corrected_for_their_own_goals_alone(corrects: boo
         Halves(), lambda achieved, goal: -np.ones(achieved.shape[:-1]), 1.0, 1.0, corrects
     )
     made = maker.make(episodes, [np.ones((1, 1), np.float32)])
-    own, replayed = made.value_target
+    own, replayed = made.value_target.reshape(2, 3)
     assert own.tolist() == [-3.0, -2.0, -1.0]
     assert replayed.tolist() == ([-1.75, -1.5, -1.0] if corrects else own.tolist())
 
@@ -176,11 +144,12 @@ def one_step(
     return Episodes(observation, achieved, goal, action[:, None].astype(np.float32))
 
 
-def improve(learner: PPO, rollouts: Rollouts, generator: np.random.Generator) -> None:
+def improve(learner: PPO, rollouts: RolloutTransitions, generator: np.random.Generator) -> None:
     """The updates of one cycle."""
     for _ in range(20):
-        row = generator.integers(len(rollouts.episodes), size=256)
-        learner.update(rollouts.draw(row, learner.config.gamma, generator))
+        row = generator.integers(len(rollouts.reward), size=256)
+        arrays = {each.name: getattr(rollouts, each.name)[row] for each in fields(rollouts)}
+        learner.update(RolloutTransitions(**arrays))
     learner.average()
 
 
@@ -282,7 +251,8 @@ def test_outcomes_near_what_was_asked_for_come_first() -> None:
     episodes = Episodes(nothing, achieved, asked, nothing[:, 1:])
     generator = np.random.default_rng(0)
     outcomes = Outcomes.of(episodes, GoalMetric(task_spec('FetchPush')), generator)
-    drawn = np.concatenate([outcomes.goals(episodes, generator)[:, 0] for _ in range(100)])
+    starts = Starts(episodes, np.arange(2), np.zeros(2, np.int64))
+    drawn = np.concatenate([outcomes.goals(starts, generator)[:, 0] for _ in range(100)])
     # Of eight, one at least is on the side of the goal in 255 of 256.
     assert (drawn * np.tile([1.0, -1.0], 100) > 0).mean() > 0.97
 
@@ -295,21 +265,16 @@ def test_rollouts_hold_every_episode_once_for_each_goal() -> None:
     other = np.array([[0.0], [-0.5]], np.float32)
     episodes = Episodes(np.zeros((2, 2, 1), np.float32), achieved, own, action)
     rollouts = maker.make(episodes, [other])
-    assert rollouts.episodes.desired_goal[:, 0].tolist() == [0.5, 0.5, 0.0, -0.5]
-    assert rollouts.reward[:, 0].tolist() == [0, -1, -1, 0]
+    assert rollouts.goal[:, 0].tolist() == [0.5, 0.5, 0.0, -0.5]
+    assert rollouts.action[:, 0].tolist() == [0.5, -0.5, 0.5, -0.5]
+    assert rollouts.reward.tolist() == [0, -1, -1, 0]
     assert rollouts.advantage.mean() == pytest.approx(0, abs=1e-6)
     assert rollouts.advantage.std() == pytest.approx(1, abs=1e-5)
-    last = learner.values(np.zeros((4, 1), np.float32), rollouts.episodes.desired_goal)
-    np.testing.assert_allclose(rollouts.value_target[:, 0], rollouts.reward[:, 0] + 0.5 * last)
-    logs = learner.log_probabilities(
-        np.zeros((4, 1), np.float32), rollouts.episodes.desired_goal, rollouts.episodes.action[:, 0]
-    )
-    np.testing.assert_allclose(rollouts.log_probability[:, 0], logs, rtol=1e-5)
-    row = np.arange(50) % 4
-    batch = rollouts.draw(row, 0.5, np.random.default_rng(0))
-    np.testing.assert_array_equal(batch.goal, rollouts.episodes.desired_goal[row])
-    place = np.where(batch.goal[:, 0] == 0.5, batch.action[:, 0] < 0, 2 + (batch.goal[:, 0] < 0))
-    np.testing.assert_array_equal(batch.reward, rollouts.reward[place.astype(int), 0])
+    states = np.zeros((4, 1), np.float32)
+    last = learner.values(states, rollouts.goal)
+    np.testing.assert_allclose(rollouts.value_target, rollouts.reward + 0.5 * last)
+    logs = learner.log_probabilities(states, rollouts.goal, rollouts.action)
+    np.testing.assert_allclose(rollouts.log_probability, logs, rtol=1e-5)
 
 
 @pytest.mark.parametrize('share', [0.0, 0.75, 1.0])

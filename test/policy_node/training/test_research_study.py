@@ -38,7 +38,7 @@ from policy_node.training.studies.store import (
     read_runs,
     require_alike,
 )
-from policy_node.training.studies.study import Job, Study, research_jobs, to_settings
+from policy_node.training.studies.study import Job, Study, to_settings
 from support import ROOT
 from support.full_disk import files_at_most
 
@@ -95,7 +95,7 @@ def test_another_seed_can_be_added_to_every_page(study: Study) -> None:
     folder = ROOT / 'docs' / 'research' / study.name
     names = {(run['task'], run['arm']) for run in read_runs(folder).values()}
     for task, arm in names:
-        jobs = research_jobs(study, [task], [study.arm(arm)], range(9), {}, Path('runs'))
+        jobs = study.jobs([task], [study.arm(arm)], range(9), {}, Path('runs'))
         require_alike(study, jobs, folder)
 
 
@@ -191,6 +191,7 @@ def test_a_study_runs_measures_and_gives_the_same_bits_again(
     assert runs[:-2] == kept
     for arm, run in zip(('future', 'weighted'), runs[-2:], strict=True):
         assert (run['arm'], run['env_steps'], run['parts']) == (arm, 800, 1)
+        assert run['curve'][-1][0] == 800
         assert run['processor_seconds'] > 0 and run['command'].startswith(
             'fetch_hand_sim benchmark --study unb'
         )
@@ -233,19 +234,6 @@ def test_a_stored_run_is_not_trained_again_and_another_seed_is_added(
         assert 'FetchReach/actual with batch_size 256, now 32' in error
         assert error.count('\n') == 1 and not (tmp_path / 'other').exists()
     assert {path.name: path.read_bytes() for path in report.iterdir()} == kept
-
-
-@pytest.mark.release
-def test_a_killed_measurement_is_done_again_without_training(tmp_path: Path) -> None:
-    report = tmp_path / 'report'
-    arguments = [*SMALL, '--arms', 'actual', '--output', str(tmp_path), '--report', str(report)]
-    assert main(arguments) == 0
-    (run,) = read_runs(report).values()
-    log = tmp_path / 'FetchReach' / 'actual' / 'seed0' / 'progress.csv'
-    before = log.read_bytes()
-    (report / 'runs.jsonl').unlink()
-    assert main(arguments) == 0
-    assert list(read_runs(report).values()) == [run] and log.read_bytes() == before
 
 
 def store(folder: Path, jobs: list[Job], machine: str = 'A', seconds: float = 10.0) -> None:
@@ -336,6 +324,11 @@ def test_a_run_with_a_damaged_actor_or_log_is_one_line(
     arguments = [*SMALL, '--arms', 'actual', '--output', str(tmp_path), '--report', str(report)]
     assert main(arguments) == 0
     folder = tmp_path / 'FetchReach' / 'actual' / 'seed0'
+    (run,), log = read_runs(report).values(), (folder / 'progress.csv').read_bytes()
+    (report / 'runs.jsonl').unlink()
+    assert main(arguments) == 0, 'measured again without training'
+    assert list(read_runs(report).values()) == [run]
+    assert (folder / 'progress.csv').read_bytes() == log
     (report / 'runs.jsonl').unlink()
     capsys.readouterr()
     write_file(folder / 'latest.safetensors', b'cut')

@@ -14,8 +14,13 @@ from policy_node.training.configuration.recipes import recipe_config
 from policy_node.training.experience.replay import Episodes, Starts
 from policy_node.training.experience.sampling import TransitionSampler
 from policy_node.training.machine import Workers
-from policy_node.training.research.conditions import ConditionedSampler, Horizon, Threshold, fold
-from policy_node.training.research.judged import ChoosingSampler, CuttingSampler, LambdaSampler
+from policy_node.training.research.conditions import HorizonSampler, fold
+from policy_node.training.research.judged import (
+    SCORES,
+    ChoosingSampler,
+    CuttingSampler,
+    LambdaSampler,
+)
 from policy_node.training.research.registry import make_ddpg, make_sampler
 
 torch.set_num_threads(1)
@@ -43,16 +48,10 @@ def draw(episodes, sampler, mixture=REAL):
 
 
 class Judge:
-    """Acts as the walk does before place 3 and otherwise after; likes goals near 5."""
+    """Acts as the walk does before place 3 and otherwise after."""
 
     def act(self, observation, goal):
         return np.where(observation < 3.0, 1.0, -1.0).astype(np.float32)
-
-    def bellman(self, batch):
-        return -np.abs(batch.goal[:, 0] - 5.0)
-
-    def uncertain(self, batch):
-        return batch.goal[:, 0]
 
 
 def test_several_steps_of_one_are_one_step(walk):
@@ -85,31 +84,21 @@ def test_cut_ends_a_return_before_an_action_the_actor_would_not_take(walk):
     assert (last == expected).all()
 
 
-@pytest.mark.parametrize(('choice', 'lowest'), [('bellman', 4.0), ('uncertain', 4.0)])
-def test_the_best_of_several_future_goals_is_taken(walk, choice, lowest):
+@pytest.mark.parametrize('wanted', [5.0, 6.0])
+def test_the_best_of_several_future_goals_is_taken(
+    walk: Episodes, wanted: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(SCORES, 'bellman', lambda _, batch: -np.abs(batch.goal[:, 0] - wanted))
     mixture = {'future': 0.5, 'real': 0.5}
     any_goal = draw(walk, TransitionSampler(at_goal, 0.9), mixture)
-    batch = draw(walk, ChoosingSampler(at_goal, 0.9, choice=choice, judge=Judge()), mixture)
+    batch = draw(walk, ChoosingSampler(at_goal, 0.9, choice='bellman', judge=Judge()), mixture)
     early = batch.observation[:, 0] == 0.0
-    wanted = 5.0 if choice == 'bellman' else 6.0
     share = (batch.goal[early, 0] == wanted).mean()
     # One of eight uniform draws from six places is the best with 1 - (5/6)^8 = .77; half stay real.
     assert share == pytest.approx(0.5 * 0.77, abs=0.07)
     assert (any_goal.goal[early, 0] == wanted).mean() < 0.15
     assert (batch.goal[early, 0] == 4.0).mean() >= 0.45
-    assert (batch.goal[:, 0] >= np.minimum(batch.observation[:, 0] + 1, lowest)).all()
-
-
-def test_a_threshold_is_in_the_reward_and_in_the_input():
-    metric = GoalMetric(task_spec('FetchReach'))
-    condition = Threshold(metric, widest=8.0)
-    drawn = condition.draw(2_000, np.random.default_rng(0))
-    assert 0.5 <= drawn.min() < 0.55 and 7.0 < drawn.max() <= 8.0
-    assert np.median(drawn) == pytest.approx(2.0, abs=0.2), 'log-uniform'
-    achieved, desired = np.zeros((3, 3)), np.array([[0.09, 0, 0]] * 3)
-    reward = condition.reward(achieved, desired, np.array([1.0, 1.7, 1.9]))
-    assert reward.tolist() == [-1.0, -1.0, 0.0]
-    np.testing.assert_allclose(condition.inputs(np.array([1.0, np.e])), [[0.0], [1.0]], atol=1e-6)
+    assert (batch.goal[:, 0] >= np.minimum(batch.observation[:, 0] + 1, 4.0)).all()
 
 
 class Halved(GoalMetric):
@@ -158,7 +147,7 @@ def test_values_count_the_rewards_of_the_steps_left(walk):
     options = {'precision': 'float32', 'gamma': 0.5, 'learning_rate': 3e-3, 'target': 'none'}
     config = recipe_config('FetchReach', 'paper', condition='horizon', **options)
     learner = make_ddpg(NetworkShape(1, 1, 1, (32, 32)), config, torch.device('cpu'), Workers())
-    sampler = ConditionedSampler(past_goal, 0.5, condition=Horizon(3, past_goal))
+    sampler = HorizonSampler(past_goal, 0.5, ticks=3)
     generator = np.random.default_rng(0)
     # Whatever is done, a walk goes on: values of all actions are alike.
     walk.action[:] = generator.uniform(-1, 1, walk.action.shape)

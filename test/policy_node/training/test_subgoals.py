@@ -11,7 +11,6 @@ from policy_node.policies.actor import Actor
 from policy_node.policies.network_shape import NetworkShape
 from policy_node.training.configuration.flat import from_flat
 from policy_node.training.experience.replay import Episodes
-from policy_node.training.experience.sampling import TransitionSampler
 from policy_node.training.research.hierarchy import (
     TESTED,
     GuidedPolicy,
@@ -116,8 +115,12 @@ def test_what_was_achieved_was_proposed_unless_a_test_was_missed(subgoal, tested
 
     The second proposal of 3 is missed, at 6.
     """
-    rewards = TransitionSampler(lambda a, g: -1.0 * (a != g)[..., 0], 0.5)
-    sampler = SubgoalSampler(rewards, 3, missed_value=-2.0)
+    sampler = SubgoalSampler(
+        compute_reward=lambda a, g: -1.0 * (a != g)[..., 0],
+        gamma=0.5,
+        most_steps=3,
+        missed_value=-2.0,
+    )
     row = np.zeros(300, np.int64)
     episodes = walk(subgoal, tested)
     batch = sampler.sample(episodes, row, {'real': 1.0}, np.random.default_rng(0))
