@@ -10,14 +10,14 @@ from __future__ import annotations
 
 import re
 import struct
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from msgs_spec.arrays import Array
-from msgs_spec.rotations import IDENTITY, wxyz_to_xyzw, xyzw_to_wxyz
+from msgs_spec.rotations import IDENTITY
 from msgs_spec.schemas import deserialize, message_class, serialize
 from msgs_spec.topics import TopicSpec
 
@@ -126,36 +126,38 @@ def _stamped(topic: TopicSpec, stamp: int, fields: dict[str, Any]) -> Any:
     return message(**fields)
 
 
-def _geometry(name: str, **fields: Any) -> Any:
-    return message_class(f'geometry_msgs/msg/{name}')(**fields)
+# Fields and types of the composed types of geometry_msgs, in the order of the vector.
+_FIELDS = {
+    'Pose': {'position': 'Point', 'orientation': 'Quaternion'},
+    'Transform': {'translation': 'Vector3', 'rotation': 'Quaternion'},
+    'Twist': {'linear': 'Vector3', 'angular': 'Vector3'},
+    'Wrench': {'force': 'Vector3', 'torque': 'Vector3'},
+}
 
 
-def _xyz(name: str, values: Array) -> Any:
-    x, y, z = values.tolist()
-    return _geometry(name, x=x, y=y, z=z)
+def _build_geometry(name: str, values: Iterator[float]) -> Any:
+    """Return a message of a type of geometry_msgs from the next values."""
+    if name in _FIELDS:
+        parts = {field: _build_geometry(kind, values) for field, kind in _FIELDS[name].items()}
+    else:
+        parts = {letter: next(values) for letter in _letters(name)}
+    return message_class(f'geometry_msgs/msg/{name}')(**parts)
 
 
-def _quaternion(wxyz: Array) -> Any:
-    x, y, z, w = wxyz_to_xyzw(wxyz).tolist()
-    return _geometry('Quaternion', x=x, y=y, z=z, w=w)
+def _geometry(name: str, values: ArrayLike) -> Any:
+    return _build_geometry(name, iter(np.asarray(values).tolist()))
 
 
-def _pose(position: Array, wxyz: Array) -> Any:
-    return _geometry('Pose', position=_xyz('Point', position), orientation=_quaternion(wxyz))
+def _read_geometry(name: str, message: Any) -> list[float]:
+    """Return the numbers of a message of a type of geometry_msgs."""
+    if name not in _FIELDS:
+        return [getattr(message, letter) for letter in _letters(name)]
+    parts = (_read_geometry(kind, getattr(message, each)) for each, kind in _FIELDS[name].items())
+    return [value for part in parts for value in part]
 
 
-def _two_vectors(name: str, first: str, second: str, values: Array) -> Any:
-    parts = {first: _xyz('Vector3', values[:3]), second: _xyz('Vector3', values[3:])}
-    return _geometry(name, **parts)
-
-
-def _read_xyz(*parts: Any) -> list[float]:
-    return [value for part in parts for value in (part.x, part.y, part.z)]
-
-
-def _read_pose(position: Any, orientation: Any) -> Array:
-    xyzw = [orientation.x, orientation.y, orientation.z, orientation.w]
-    return np.concatenate([_read_xyz(position), xyzw_to_wxyz(xyzw)])
+def _letters(name: str) -> str:
+    return 'wxyz' if name == 'Quaternion' else 'xyz'
 
 
 def _build_joint_state(topic: TopicSpec, values: Array) -> dict[str, Any]:
@@ -180,12 +182,10 @@ def _by_name(topic: TopicSpec, names: Sequence[str], values: Array) -> Array:
 
 
 def _build_free_joint(topic: TopicSpec, values: Array) -> dict[str, Any]:
-    translation, rotation = _xyz('Vector3', values[:3]), _quaternion(values[3:7])
-    transform = _geometry('Transform', translation=translation, rotation=rotation)
     return {
         'joint_names': list(topic.names),
-        'transforms': [transform],
-        'twist': [_two_vectors('Twist', 'linear', 'angular', values[7:])],
+        'transforms': [_geometry('Transform', values[:7])],
+        'twist': [_geometry('Twist', values[7:])],
         'wrench': [],
     }
 
@@ -199,15 +199,14 @@ def _read_free_joint(topic: TopicSpec, message: Any) -> Array:
             f'{topic.name}: {len(message.transforms)} transforms and {len(message.twist)} twists '
             'given; allowed: 1 of each'
         )
-    transform, twist = message.transforms[0], message.twist[0]
-    pose = _read_pose(transform.translation, transform.rotation)
-    return np.concatenate([pose, _read_xyz(twist.linear, twist.angular)])
+    pose = _read_geometry('Transform', message.transforms[0])
+    return np.array([*pose, *_read_geometry('Twist', message.twist[0])])
 
 
 def _build_pose_array(topic: TopicSpec, values: Array) -> dict[str, Any]:
     rows = values.reshape(len(topic.layout), -1)
     # Goals have no orientation.
-    return {'poses': [_pose(row[:3], row[3:] if row.size == 7 else IDENTITY) for row in rows]}
+    return {'poses': [_geometry('Pose', [*row, *IDENTITY][:7]) for row in rows]}
 
 
 def _read_pose_array(topic: TopicSpec, message: Any) -> Array:
@@ -217,8 +216,8 @@ def _read_pose_array(topic: TopicSpec, message: Any) -> Array:
             f'{topic.name}: {len(message.poses)} poses given; allowed: {len(names)}, in the order '
             f'{", ".join(names)}'
         )
-    poses = [_read_pose(pose.position, pose.orientation)[:size] for pose in message.poses]
-    return np.concatenate([np.zeros(0), *poses])
+    poses = [_read_geometry('Pose', pose)[:size] for pose in message.poses]
+    return np.array(poses, dtype=np.float64).ravel()
 
 
 def _build_multi_array(topic: TopicSpec, values: Array) -> dict[str, Any]:
@@ -235,28 +234,12 @@ _CODECS: dict[str, tuple[_Builder, _Reader]] = {
     'rosgraph_msgs/msg/Clock': (lambda _, values: {}, lambda _, message: []),
     'sensor_msgs/msg/JointState': (_build_joint_state, _read_joint_state),
     'sensor_msgs/msg/MultiDOFJointState': (_build_free_joint, _read_free_joint),
-    'geometry_msgs/msg/PointStamped': (
-        lambda _, values: {'point': _xyz('Point', values)},
-        lambda _, message: _read_xyz(message.point),
-    ),
     # Vectors of one number.
     'geometry_msgs/msg/Vector3Stamped': (
-        lambda _, values: {'vector': _xyz('Vector3', np.array([values[0], 0.0, 0.0]))},
+        lambda _, values: {'vector': _geometry('Vector3', [values[0], 0.0, 0.0])},
         lambda _, message: [message.vector.x],
     ),
-    'geometry_msgs/msg/PoseStamped': (
-        lambda _, values: {'pose': _pose(values[:3], values[3:])},
-        lambda _, message: _read_pose(message.pose.position, message.pose.orientation),
-    ),
     'geometry_msgs/msg/PoseArray': (_build_pose_array, _read_pose_array),
-    'geometry_msgs/msg/TwistStamped': (
-        lambda _, values: {'twist': _two_vectors('Twist', 'linear', 'angular', values)},
-        lambda _, message: _read_xyz(message.twist.linear, message.twist.angular),
-    ),
-    'geometry_msgs/msg/WrenchStamped': (
-        lambda _, values: {'wrench': _two_vectors('Wrench', 'force', 'torque', values)},
-        lambda _, message: _read_xyz(message.wrench.force, message.wrench.torque),
-    ),
     'std_msgs/msg/Float64': (
         lambda _, values: {'data': float(values[0])},
         lambda _, message: [message.data],
@@ -269,6 +252,20 @@ _CODECS: dict[str, tuple[_Builder, _Reader]] = {
         _build_multi_array,
         lambda _, message: np.array(message.data, dtype=np.float64),
     ),
+}
+
+
+def _stamped_codec(name: str) -> tuple[_Builder, _Reader]:
+    field = name.lower()
+    return (
+        lambda _, values: {field: _geometry(name, values)},
+        lambda _, message: _read_geometry(name, getattr(message, field)),
+    )
+
+
+_CODECS |= {
+    f'geometry_msgs/msg/{name}Stamped': _stamped_codec(name)
+    for name in ('Point', 'Pose', 'Twist', 'Wrench')
 }
 
 
@@ -350,17 +347,8 @@ class TopicCodec:
             stamps = seconds.astype(np.int64) * 10**9 + nanoseconds
         if self._is_bool:
             return stamps, (messages[:, _BODY : _BODY + 1] != 0).astype(np.float64)
-        return stamps, self._vectors(messages)
-
-    def _vectors(self, messages: NDArray[np.uint8]) -> Array:
-        """Return the numbers (n, topic.size) of messages (n, size)."""
-        if not self._slots.size:
-            return np.zeros((len(messages), 0))
-        first = int(self._slots.min())
-        end = int(self._slots.max()) + 1
-        places = slice(_BODY + _FLOAT.size * first, _BODY + _FLOAT.size * end)
-        numbers = messages[:, places].copy().view('<f8')
-        return np.take(numbers, self._slots - first, axis=1).astype(np.float64, copy=False)
+        floats = messages[:, _BODY : _BODY + _FLOAT.size * self._floats].copy().view('<f8')
+        return stamps, np.take(floats, self._slots, axis=1).astype(np.float64, copy=False)
 
     def _fixed_runs(self) -> list[slice]:
         """Run of bytes that are the same in all messages."""

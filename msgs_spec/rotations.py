@@ -19,16 +19,6 @@ IDENTITY.flags.writeable = False
 _SINGULAR = 4.0 * np.finfo(np.float64).eps
 
 
-def wxyz_to_xyzw(quaternion: ArrayLike) -> Array:
-    """Return MuJoCo quaternions (..., 4) in the order of ROS messages."""
-    return np.ascontiguousarray(np.roll(np.asarray(quaternion, dtype=np.float64), -1, axis=-1))
-
-
-def xyzw_to_wxyz(quaternion: ArrayLike) -> Array:
-    """Return quaternions (..., 4) from ROS messages in MuJoCo's order."""
-    return np.ascontiguousarray(np.roll(np.asarray(quaternion, dtype=np.float64), 1, axis=-1))
-
-
 def _parts(array: ArrayLike) -> list[Any]:
     """Return the components along the last axis, each a contiguous array."""
     values = np.asarray(array, dtype=np.float64)

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -37,6 +37,21 @@ PHASES: dict[Phase, str] = {
 
 # Values that the message leaves out.
 _LEFT_OUT = {'joint_prefix': JOINT_PREFIX, 'disturbances': '', 'variation': ''}
+
+_CHOICES: dict[str, tuple[str, ...]] = {
+    'phase': tuple(PHASES),
+    'reward_type': REWARD_TYPES,
+    'success_rule': SUCCESS_RULES,
+}
+# As Python, C++ and YAML write them.
+_FLAGS = {'True': True, 'true': True, '1': True, 'False': False, 'false': False, '0': False}
+# Functions that read a value, by the type of its field.
+_READERS: dict[str, Callable[[str], Any]] = {
+    'str': str,
+    'int': int,
+    'float': float,
+    'bool': _FLAGS.__getitem__,
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -87,30 +102,19 @@ class EpisodeStatus:
         missing = [f.name for f in dataclasses.fields(cls) if f.name not in values]
         if missing:
             raise ValueError(f'episode_status without {", ".join(missing)}')
-        # As Python, C++ and YAML write them.
-        flags = {'True': True, 'true': True, '1': True, 'False': False, 'false': False, '0': False}
-        said = 'episode_status with'
-        phase = one_of(values['phase'], tuple(PHASES), f'{said} phase')
-        reward_type = one_of(values['reward_type'], REWARD_TYPES, f'{said} reward_type')
-        success_rule = one_of(values['success_rule'], SUCCESS_RULES, f'{said} success_rule')
-        try:
-            status = cls(
-                task=values['task'],
-                episode=int(values['episode']),
-                seed=int(values['seed']),
-                tick=int(values['tick']),
-                phase=phase,
-                control_hz=float(values['control_hz']),
-                reward_type=reward_type,
-                success_rule=success_rule,
-                episode_return=float(values['episode_return']),
-                is_success=flags[values['is_success']],
-                joint_prefix=values['joint_prefix'],
-                disturbances=values['disturbances'],
-                variation=values['variation'],
-            )
-        except (KeyError, ValueError) as error:
-            raise ValueError(f'{said} unreadable value: {error}') from None
+        found: dict[str, Any] = {}
+        for each in dataclasses.fields(cls):
+            name, text = each.name, values[each.name]
+            if name in _CHOICES:
+                found[name] = one_of(text, _CHOICES[name], f'episode_status with {name}')
+                continue
+            try:
+                found[name] = _READERS[str(each.type)](text)
+            except (KeyError, ValueError):
+                raise ValueError(
+                    f'episode_status with unreadable value: {name}={text[:40]!r}'
+                ) from None
+        status = cls(**found)
         status._require_known()
         return status
 

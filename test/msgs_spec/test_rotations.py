@@ -100,14 +100,6 @@ def test_quaternion_from_axis_angle_equals_the_reference_to_the_last_bit():
         assert_same_bits(ours, quat_from_angle_and_axis(angle, axis))
 
 
-def test_message_order_and_back():
-    wxyz = random_quaternions(3).reshape(20, 100, 4)
-    xyzw = rotations.wxyz_to_xyzw(wxyz)
-    np.testing.assert_array_equal(xyzw[..., 3], wxyz[..., 0])
-    np.testing.assert_array_equal(xyzw[..., :3], wxyz[..., 1:])
-    assert_same_bits(rotations.xyzw_to_wxyz(xyzw), wxyz)
-
-
 def test_rotation_angle_of_both_conventions():
     first = random_quaternions(4)[4:]
     angle = np.random.default_rng(5).uniform(0.1, 3.0, size=len(first))
