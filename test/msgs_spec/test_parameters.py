@@ -47,8 +47,7 @@ def test_allowed_values_pass(name, value):
 @pytest.mark.parametrize(
     ('name', 'value', 'message'),
     [
-        ('sim.task', 'fetchreach', "task: 'fetchreach' given; allowed: 'FetchReach', "),
-        ('sim.task', 'fetchreach', "; did you mean 'FetchReach'\\?$"),
+        ('sim.task', 'fetchreach', "'fetchreach' given; .*; did you mean 'FetchReach'\\?$"),
         ('sim.mode', 'lock_step', "'realtime', 'lockstep'; did you mean 'lockstep'\\?$"),
         ('sim.task', 3, 'task: 3 given; allowed: '),
         ('sim.task', None, 'task: None given; allowed: '),
@@ -211,15 +210,15 @@ def test_help_names_every_parameter_with_its_default_and_what_is_allowed(node):
 @pytest.mark.parametrize(
     'module', ['fetch_hand_sim.sim_node', 'fetch_hand_sim.replay_node', 'policy_node.node']
 )
-@pytest.mark.parametrize('arguments', [['--help'], ['-h'], ['--ros-args', '--help']])
-def test_help_is_printed_before_ros_is_loaded(module, arguments):
+def test_help_is_printed_before_ros_is_loaded(module):
     program = (
-        f'import sys; from {module} import main; code = main({arguments!r}); '
-        'assert not {"rclpy", "mujoco", "torch"} & sys.modules.keys(); sys.exit(code)'
+        f'import sys; from {module} import main; '
+        'codes = [main(["--help"]), main(["-h"]), main(["--ros-args", "--help"])]; '
+        'assert not {"rclpy", "mujoco", "torch"} & sys.modules.keys(); sys.exit(max(codes))'
     )
     done = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, '')
-    assert done.stdout.startswith('usage: ')
+    assert done.stdout.count('usage: ') == 3
 
 
 def test_new_values_are_checked_while_the_node_runs(make_node):

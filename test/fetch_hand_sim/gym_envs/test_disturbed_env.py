@@ -12,7 +12,7 @@ from gymnasium.utils.env_checker import check_env
 
 import fetch_hand_sim
 from fetch_hand_sim.simulation import Simulation
-from msgs_spec.disturbances import Disturbances, read_disturbances
+from msgs_spec.disturbances import Disturbances
 
 LATE = {'action': {'latency': 1}, 'physics': {'friction': [0.5, 2.0]}}
 
@@ -47,22 +47,6 @@ def test_environments_take_every_form_and_equal_the_simulation(tmp_path):
     assert not np.array_equal(rollout(single), expected)
     off = fetch_hand_sim.make('FetchPush', disturbances=None)
     assert np.array_equal(rollout(off), rollout(single))
-
-
-def test_presets_are_scaled_and_unknown_ones_are_rejected():
-    env = fetch_hand_sim.make('FetchReach', disturbances='hardware*0.5')
-    assert env.unwrapped.simulation.disturbances == read_disturbances('mild')
-    for make in (fetch_hand_sim.make, fetch_hand_sim.make_vec):
-        with pytest.raises(ValueError, match=r'hardwear.*allowed: none, mild, hardware, severe'):
-            make('FetchReach', disturbances='hardwear')
-
-
-def test_stable_baselines3_takes_disturbances():
-    pytest.importorskip('stable_baselines3')
-    from fetch_hand_sim.gym_envs.stable_baselines3 import FetchHandVecEnv
-
-    env = FetchHandVecEnv('FetchReach', 2, disturbances='mild')
-    assert env.batch.simulation.disturbances == read_disturbances('mild')
 
 
 @pytest.mark.parametrize('task', ['FetchPush', 'HandReach'])

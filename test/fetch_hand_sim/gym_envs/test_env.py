@@ -11,7 +11,6 @@ from contextlib import nullcontext
 import gymnasium
 import numpy as np
 import pytest
-import torch
 from gymnasium.utils.env_checker import check_env
 
 import fetch_hand_sim
@@ -21,7 +20,6 @@ from fetch_hand_sim.gym_envs.registration import environment_id
 from fetch_hand_sim.gym_envs.vector_env import FetchHandVectorEnv
 from fetch_hand_sim.simulation import Simulation, rendering
 from msgs_spec.tasks import TASKS
-from support.hindsight import assert_goals_are_exchanged
 from support.tasks import each_task
 
 # Positions are unbounded, and Gymnasium wonders about it.
@@ -59,13 +57,6 @@ def test_steps_are_rewarded_by_the_compute_reward_of_a_subclass(base):
     observation, reward, *_, info = env.step(np.zeros(env.action_space.shape, np.float32))
     goals = observation['achieved_goal'], observation['desired_goal']
     assert reward == env.compute_reward(*goals, info) and -1.0 < reward < 0.0
-
-
-def test_steps_are_rewarded_by_the_compute_reward_that_an_environment_was_given():
-    env = make('FetchReach')
-    env.unwrapped.compute_reward = lambda achieved_goal, desired_goal, info: 7.0
-    env.reset(seed=0)
-    assert env.step(np.zeros(4, np.float32))[1] == 7.0
 
 
 class Demanding:
@@ -237,6 +228,17 @@ def test_a_diverged_episode_is_truncated():
         assert env.observation_space.contains(observation)
 
 
+@pytest.mark.parametrize('goal', [0.3, [0.0, 0.0], [0.0, np.nan, 0.0]])
+def test_bad_goals_change_nothing(goal):
+    env, batch = make('FetchReach').unwrapped, fetch_hand_sim.make_vec('FetchReach', 2)
+    before = env.reset(seed=0)[0]['desired_goal']
+    with pytest.raises(ValueError, match='goal of FetchReach'):
+        env.goal = goal
+    assert np.array_equal(env.goal, before)
+    with pytest.raises(ValueError, match='goals of FetchReach'):
+        batch.unwrapped.set_attr('goal', [goal, goal])
+
+
 def test_a_goal_stays_that_of_its_episode():
     env = make('FetchReach').unwrapped
     kept, said = [], []
@@ -285,25 +287,6 @@ def test_quaternions_of_given_goals_are_normalised_or_refused():
     with pytest.raises(ValueError, match='a goal quaternion must not be zero'):
         env.reset(options={'goal': goal})
     assert state_of(env) == before
-
-
-@pytest.mark.release
-def test_stable_baselines3_learns_with_hindsight():
-    library = pytest.importorskip('stable_baselines3')
-    torch.set_num_threads(1)
-    env = make('FetchReach')
-    model = library.DDPG(
-        'MultiInputPolicy',
-        env,
-        replay_buffer_class=library.HerReplayBuffer,
-        policy_kwargs={'net_arch': [16]},
-        learning_starts=100,
-        batch_size=32,
-        seed=0,
-        device='cpu',
-    )
-    model.learn(150)
-    assert_goals_are_exchanged(model)
 
 
 def test_importing_the_package_registers_without_mujoco():
@@ -370,7 +353,12 @@ RENDER = (
 @pytest.mark.parametrize(
     ('task', 'arguments', 'spread', 'picture'),
     [
-        ('HandReach', 'render_mode="rgb_array_list"', 10, '(2, 480, 640, 3) uint8 True'),
+        (
+            'HandReach',
+            'render_mode="rgb_array_list", width=96, height=64',
+            10,
+            '(2, 64, 96, 3) uint8 True',
+        ),
         (
             'HandManipulateEggFull',
             'render_mode="rgb_array", width=800, height=60',
@@ -569,21 +557,6 @@ def test_without_a_display_a_window_says_what_it_needs(monkeypatch):
     monkeypatch.delenv('WAYLAND_DISPLAY', raising=False)
     with pytest.raises(RuntimeError, match="render_mode 'human' needs a display"):
         make('FetchReach', render_mode='human').reset(seed=0)
-
-
-@pytest.mark.parametrize('goal', [0.3, [0.0, 0.0], [0.0, np.nan, 0.0]])
-def test_a_goal_is_as_many_finite_numbers_as_the_task_has(goal):
-    env = gymnasium.make('fetch_hand_sim/FetchReach-v0').unwrapped
-    env.reset(seed=0)
-    before = env.goal.copy()
-    with pytest.raises(ValueError, match='goal of FetchReach'):
-        env.goal = goal
-    assert env.goal.tolist() == before.tolist()
-    batch = gymnasium.make_vec(
-        'fetch_hand_sim/FetchReach-v0', num_envs=2, vectorization_mode='vector_entry_point'
-    )
-    with pytest.raises(ValueError, match='goals of FetchReach'):
-        batch.set_attr('goal', [goal, goal])
 
 
 def test_a_task_is_made_by_its_name_alone():

@@ -12,7 +12,6 @@ import pytest
 from fetch_hand_sim.gym_envs.env import FetchHandEnv
 from fetch_hand_sim.simulation import Simulation
 from fetch_hand_sim.simulation.rewards import GoalMetric
-from fetch_hand_sim.simulation.tasks import make_task
 from msgs_spec.rotations import quaternion_from_axis_angle, quaternion_multiply
 from msgs_spec.tasks import TASKS, GoalKind
 
@@ -32,7 +31,7 @@ def random_goals(spec, count: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def metric(task: str, success_rule='gymnasium', reward_type='sparse'):
-    return make_task(task).goal_metric(success_rule, reward_type)
+    return GoalMetric(TASKS[task], success_rule, reward_type)
 
 
 def pose(position=(0.0, 0.0, 0.0), quaternion=IDENTITY) -> np.ndarray:

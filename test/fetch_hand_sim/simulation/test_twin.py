@@ -59,18 +59,13 @@ def assert_equal(ours: dict[str, np.ndarray], reference: dict[str, np.ndarray]) 
 
 
 @pytest.mark.parametrize('task', TASKS)
-def test_single_simulations_equal_the_reference(task, twin_seeds, play_reference):
+def test_a_single_simulation_and_a_batch_equal_the_reference(task, twin_seeds, play_reference):
     reference = play_reference(task, len(twin_seeds))
     simulation = Simulation(task, num_envs=1, num_threads=1)
     for seed in twin_seeds:
         assert_equal(
             play(simulation, [seed]), {name: a[seed : seed + 1] for name, a in reference.items()}
         )
-
-
-@pytest.mark.parametrize('task', TASKS)
-def test_a_batch_with_dense_reward_equals_the_reference(task, twin_seeds, play_reference):
-    reference = play_reference(task, len(twin_seeds))
     # The compared episodes are the last ones of a larger batch.
     count = 8 * len(twin_seeds)
     simulation = Simulation(task, num_envs=count, num_threads=3, reward_type='dense')

@@ -17,7 +17,7 @@ from msgs_spec.tasks import TASKS, task_spec
 
 TASKS_OF_ROBOTS = ['FetchReach', 'HandReach']
 COLORS = {'FetchReach': 5, 'HandReach': 2}
-CONFIGURATIONS = 100
+CONFIGURATIONS = 30
 
 
 @pytest.fixture(scope='module', params=TASKS_OF_ROBOTS)
