@@ -472,19 +472,22 @@ class VariedPhysics:
     def apply(self, ids: Ids, variations: Mapping[str, Array]) -> bool:
         """Write variations (N,) of simulations in nominal physics; return whether any are on."""
         for name in self._names:
-            change: Callable[[Ids, Mapping[str, Array]], None]
-            change = getattr(self, f'_vary_{name}', None) or self._factor(name)
-            change(ids, variations)
+            change: Callable[[Ids, Mapping[str, Array]], None] | None
+            change = getattr(self, f'_vary_{name}', None)
+            if change is not None:
+                change(ids, variations)
+            else:
+                self._multiply(ids, variations[name], dict.fromkeys(_FIELDS[name]))
         return bool(self._names)
 
-    def _factor(self, name: str) -> Callable[[Ids, Mapping[str, Array]], None]:
-        def change(ids: Ids, variations: Mapping[str, Array]) -> None:
-            for field in _FIELDS[name]:
-                values = self._live[field]
-                shape = (-1,) + (1,) * (values.ndim - 1)
-                values[ids] *= variations[name][ids].reshape(shape)
-
-        return change
+    def _multiply(
+        self, ids: Ids, factors: Array, fields: Mapping[str, NDArray[np.integer] | None]
+    ) -> None:
+        """Multiply some rows of model fields, or all (None), by the factors (N,)."""
+        for field, rows in fields.items():
+            values = self._live[field]
+            factor = factors[ids].reshape((-1,) + (1,) * (values.ndim - 1))
+            values[ids if rows is None else np.ix_(ids, rows)] *= factor
 
     def _vary_object_mass(self, ids: Ids, variations: Mapping[str, Array]) -> None:
         factor, body, live = variations['object_mass'][ids], self._body, self._live
@@ -499,23 +502,14 @@ class VariedPhysics:
         live['dof_invweight0'][ids, first : first + 6] /= factor[:, None]
 
     def _vary_object_size(self, ids: Ids, variations: Mapping[str, Array]) -> None:
-        model, factor = self._task.model, variations['object_size'][ids]
+        model = self._task.model
         geoms = np.flatnonzero(model.geom_bodyid == self._body)
         boxes = int(model.body_bvhadr[self._body]) + np.arange(int(model.body_bvhnum[self._body]))
-        rows: dict[str, Any] = {
-            'geom_size': geoms,
-            'geom_rbound': geoms,
-            'geom_aabb': geoms,
-            'bvh_aabb': boxes,
-        }
-        for field, places in rows.items():
-            values = self._live[field]
-            shape = (-1,) + (1,) * (values.ndim - 1)
-            values[np.ix_(ids, places)] *= factor.reshape(shape)
+        fields = dict.fromkeys(('geom_size', 'geom_rbound', 'geom_aabb'), geoms)
+        self._multiply(ids, variations['object_size'], {**fields, 'bvh_aabb': boxes})
 
     def _vary_damping(self, ids: Ids, variations: Mapping[str, Array]) -> None:
-        factor, places = variations['damping'][ids], np.ix_(ids, self._task.joint_dofs)
-        self._live['dof_damping'][places] *= factor[:, None]
+        self._multiply(ids, variations['damping'], {'dof_damping': self._task.joint_dofs})
 
     def _vary_gravity_tilt(self, ids: Ids, variations: Mapping[str, Array]) -> None:
         tilt, direction = variations['gravity_tilt'][ids], variations['gravity_direction'][ids]

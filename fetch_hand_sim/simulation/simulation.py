@@ -11,7 +11,7 @@ import copy
 import logging
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, TypeVar
@@ -36,6 +36,7 @@ from fetch_hand_sim.simulation.arguments import (
 from fetch_hand_sim.simulation.disturber import Disturber
 from fetch_hand_sim.simulation.models import asset_path, find
 from fetch_hand_sim.simulation.tasks import Task, make_task
+from fetch_hand_sim.simulation.tasks.task import BatchConfig
 from msgs_spec.arrays import Array
 from msgs_spec.disturbances import Disturbances, read_disturbances
 from msgs_spec.observations import Readings, achieved_goal
@@ -124,14 +125,8 @@ class Simulation:
         if not isinstance(keeps_data, bool):
             raise ValueError(f'keeps_data {keeps_data!r:.60}; allowed: True or False')
         one_of(timing, TIMINGS, 'timing')
-        self._arguments: dict[str, Any] = {
-            'num_envs': num_envs,
-            'num_threads': num_threads,
-            'control_hz': control_hz,
-            'keeps_data': keeps_data,
-            'timing': timing,
-        }
-        self._task = make_task(task, **self._arguments)
+        self._batch = BatchConfig(num_envs, num_threads, control_hz, keeps_data, timing)
+        self._task = make_task(task, self._batch)
         self._model_may_change = False
         self.spec = self._task.spec
         self.num_envs = num_envs
@@ -408,7 +403,7 @@ class Simulation:
         return {
             'arguments': {
                 'task': self.spec.name,
-                **self._arguments,
+                **asdict(self._batch),
                 'disturbances': self.disturbances,
             },
             'disturbed': None if self._disturber is None else self._disturber.state(),

@@ -12,31 +12,22 @@ from msgs_spec.tasks import (
     DEFAULT_CONTROL_HZ,
     PHYSICS_TIMESTEP,
     TaskSpec,
-    Timing,
-    substeps_per_tick,
     task_spec,
     third_party_simulation,
 )
 
 
-def make_task(
-    name: str,
-    *,
-    num_envs: int = 1,
-    num_threads: int = 0,
-    control_hz: float = DEFAULT_CONTROL_HZ,
-    keeps_data: bool = False,
-    timing: Timing = 'seconds',
-) -> Task:
-    """Compile the model of a task and start its simulations; arguments as in `BatchConfig`.
+def make_task(name: str, batch: BatchConfig | None = None) -> Task:
+    """Compile the model of a task and start its simulations.
 
     Raises:
         ValueError: If the task is unknown or the rate is not allowed. For third-party tasks also if
             the simulation is missing, or its model differs from its `ASSET`, has another time step
             than `PHYSICS_TIMESTEP`, or lacks a joint of the specification.
     """
-    spec = task_spec(name, control_hz=control_hz if timing == 'seconds' else DEFAULT_CONTROL_HZ)
-    batch = BatchConfig(num_envs, num_threads, substeps_per_tick(control_hz), keeps_data, timing)
+    batch = batch or BatchConfig()
+    control_hz = batch.control_hz if batch.timing == 'seconds' else DEFAULT_CONTROL_HZ
+    spec = task_spec(name, control_hz=control_hz)
     task: Task = _family(spec)(spec, batch)
     if str(task.asset) != (named := task_asset(name)):
         raise ValueError(

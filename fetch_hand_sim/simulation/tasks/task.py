@@ -28,7 +28,14 @@ from fetch_hand_sim.simulation.rewards import GoalMetric
 from msgs_spec.arrays import Array
 from msgs_spec.observations import Readings, achieved_goal, observation, observed_topics
 from msgs_spec.robots import command_from_action
-from msgs_spec.tasks import RewardType, SuccessRule, TaskSpec, Timing
+from msgs_spec.tasks import (
+    DEFAULT_CONTROL_HZ,
+    RewardType,
+    SuccessRule,
+    TaskSpec,
+    Timing,
+    substeps_per_tick,
+)
 from msgs_spec.topics import sensor_topics
 
 _LOGGER = logging.getLogger(__name__)
@@ -98,16 +105,21 @@ class BatchConfig:
     Attributes:
         num_envs: Number of simulations N.
         num_threads: Threads that step them; 0 for all processors that the process may use.
-        substeps: Physics steps per action.
+        control_hz: Actions per simulated second: 500/n for n = 1 ... 40.
         keeps_data: Whether each simulation keeps its own `MjData` with all derived values.
         timing: Quantities that other rates than 25 Hz keep, see `msgs_spec.tasks.Timing`.
     """
 
     num_envs: int = 1
     num_threads: int = 0
-    substeps: int = 20
+    control_hz: float = DEFAULT_CONTROL_HZ
     keeps_data: bool = False
     timing: Timing = 'seconds'
+
+    @property
+    def substeps(self) -> int:
+        """Physics steps per action; ValueError for other rates."""
+        return substeps_per_tick(self.control_hz)
 
     @property
     def threads(self) -> int:
