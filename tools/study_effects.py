@@ -23,8 +23,11 @@ _ENOUGH_SEEDS = 5
 # Blue and grey of Okabe and Ito's palette, which colour-blind readers can tell apart.
 _CLEAR, _UNCLEAR = '#0072B2', '#999999'
 
+# Width in inches: on a phone of 390 px, 8 points become 8 px.
+_WIDTH, _ROW = 5.2, 0.19
+
 Effect = tuple[str, float, float, float, bool]
-"""Name, mean difference of the area, the ends of its interval, and significance."""
+"""Task and variant, mean difference of the area, the ends of its interval, and significance."""
 
 
 def effects(study: str) -> list[Effect]:
@@ -40,7 +43,7 @@ def effects(study: str) -> list[Effect]:
         base = areas.get((task, baseline), [])
         if variant != baseline and min(len(values), len(base)) >= _ENOUGH_SEEDS:
             low, high = interval(values, base)
-            name = f'{study}, {task}: {variant} - {baseline}'
+            name = f'{task}: {variant}'
             clear = is_significant(rows[task, variant], rows[task, baseline], 'area')
             found.append((name, float(np.mean(values) - np.mean(base)), low, high, clear))
     return found
@@ -54,28 +57,34 @@ def interval(values: list[float], base: list[float]) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def draw(rows: list[Effect]) -> Figure:
-    """Return a forest plot; differences that are not significant are grey."""
-    figure = Figure(figsize=(9, 0.22 * len(rows) + 1.2), layout='constrained')
-    axes = figure.subplots()
-    for place, (_, mean, low, high, clear) in enumerate(rows):
-        color = _CLEAR if clear else _UNCLEAR
-        axes.plot([low, high], [place, place], color=color, linewidth=1.5)
-        axes.plot([mean], [place], 'o', color=color, markersize=4)
-    axes.axvline(0, color='black', linewidth=0.8)
-    axes.set_yticks(range(len(rows)), [name for name, *_ in rows], fontsize=8)
-    axes.set_ylim(len(rows) - 0.3, -0.7)
-    axes.set_xlabel('difference of the mean success over the budget (area), 95 % interval')
-    axes.grid(axis='x', alpha=0.3)
+def draw(studies: dict[str, list[Effect]]) -> Figure:
+    """Return a forest plot, one panel per study; differences that are not significant are grey."""
+    sizes = [len(rows) for rows in studies.values()]
+    height = _ROW * (sum(sizes) + 2 * len(sizes)) + 0.5
+    figure = Figure(figsize=(_WIDTH, height), layout='constrained')
+    panels = figure.subplots(len(sizes), sharex=True, height_ratios=sizes)
+    for axes, (study, rows) in zip(panels, studies.items(), strict=True):
+        for place, (_, mean, low, high, clear) in enumerate(rows):
+            color = _CLEAR if clear else _UNCLEAR
+            axes.plot([low, high], [place, place], color=color, linewidth=1.5)
+            axes.plot([mean], [place], 'o', color=color, markersize=4)
+        axes.axvline(0, color='black', linewidth=0.8)
+        axes.set_yticks(range(len(rows)), [name for name, *_ in rows], fontsize=8)
+        axes.set_ylim(len(rows) - 0.4, -0.6)
+        title = f'{study}, compared with {STUDIES[study].arms[0].name}'
+        axes.set_title(title, fontsize=9, loc='left')
+        axes.grid(axis='x', alpha=0.3)
+    panels[-1].set_xlabel('difference of the area, 95 % interval', fontsize=9)
     return figure
 
 
 def main() -> int:
     """Write the figure; return the exit code."""
     names = [name for name in STUDIES if (RESEARCH / name / 'runs.jsonl').is_file()]
-    rows = [row for name in names for row in effects(name)]
-    draw(rows).savefig(RESEARCH / 'effects.png', dpi=110)
-    print(f'{len(rows)} comparisons in {RESEARCH / "effects.png"}')
+    studies = {name: rows for name in names if (rows := effects(name))}
+    draw(studies).savefig(RESEARCH / 'effects.png', dpi=150)
+    count = sum(map(len, studies.values()))
+    print(f'{count} comparisons in {RESEARCH / "effects.png"}')
     return 0
 
 
