@@ -232,6 +232,19 @@ def test_a_replay_that_will_exceed_the_memory_is_reported_at_the_start(
         assert ('a smaller replay_transitions would fit' in capsys.readouterr().err) == warns
 
 
+@pytest.mark.parametrize('is_supported', [True, False])
+def test_a_processor_that_emulates_bfloat16_is_reported(
+    tmp_path, monkeypatch, capsys, is_supported
+):
+    monkeypatch.setattr('torch.cpu._is_avx512_bf16_supported', lambda: is_supported)
+    arguments = ['--task', 'FetchReach', '--steps', '100', '--threads', '1', '--torch-threads', '1']
+    for setting in ('num_envs=2', 'updates_per_cycle=1', 'evaluation_episodes=2'):
+        arguments += ['--set', setting]
+    arguments += ['--set', 'device=cpu', '--set', 'precision=bfloat16']
+    assert main([*arguments, '--output', str(tmp_path)]) == 0
+    assert ('use precision=float32' in capsys.readouterr().err) != is_supported
+
+
 def test_the_available_memory_is_known_here():
     available = available_memory()
     assert available is not None and 10**7 < available < 10**14
