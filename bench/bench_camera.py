@@ -24,7 +24,7 @@ from bench_rate import Watcher, report  # noqa: E402
 from bench_view import start  # noqa: E402
 
 from msgs_spec.tasks import TASKS, task_spec  # noqa: E402
-from msgs_spec.topics import topic, view_topic  # noqa: E402
+from msgs_spec.topics import topic, view_topics  # noqa: E402
 from node_runtime.event_loop import EventLoop  # noqa: E402
 from node_runtime.ros import (  # noqa: E402
     keep_discovery_local,
@@ -50,7 +50,7 @@ def look(task: str, name: str, seconds: float) -> None:
     keep_discovery_local()
     rclpy.init()
     node, sizes = rclpy.create_node('looking'), list[int]()
-    source = view_topic(task_spec(task), name)
+    source = {each.name: each for each in view_topics(task_spec(task))}[name]
     node.create_subscription(
         ros_message_class(source.type_name),
         source.name,

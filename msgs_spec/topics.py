@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from typing import Literal
 
 from msgs_spec.robots import FINGERTIPS
 from msgs_spec.tasks import GoalKind, TaskSpec, VectorPart
+from msgs_spec.text import one_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -277,14 +277,8 @@ def topics(task: TaskSpec) -> tuple[TopicSpec, ...]:
 
 def topic(task: TaskSpec, name: str) -> TopicSpec:
     """Return the topic of a task by name, or raise ValueError, which lists all names."""
-    return _named(task, topics(task), name)
-
-
-def _named(task: TaskSpec, specs: Iterable[TopicSpec], name: str, use: str = '') -> TopicSpec:
-    found = {spec.name: spec for spec in specs}
-    if name not in found:
-        raise ValueError(f'{task.name} has no topic {name!r}{use}; allowed: {", ".join(found)}')
-    return found[name]
+    found = {spec.name: spec for spec in topics(task)}
+    return found[one_of(name, list(found), f'{task.name} has no topic')]
 
 
 # Topics of `visualization_node`, for standard tools; none of them is logged.
@@ -351,11 +345,6 @@ def scalar_topics(task: TaskSpec) -> tuple[TopicSpec, ...]:
 def view_topics(task: TaskSpec) -> tuple[TopicSpec, ...]:
     """Return all topics of `visualization_node` for a task."""
     return (*SHOWN, *scalar_topics(task))
-
-
-def view_topic(task: TaskSpec, name: str) -> TopicSpec:
-    """Return a topic of `visualization_node` by name, or raise ValueError."""
-    return _named(task, view_topics(task), name, ' to view')
 
 
 # Services

@@ -19,7 +19,7 @@ from fetch_hand_sim.simulation import Observation, StepResult
 from fetch_hand_sim.simulation.arguments import finite_numbers, require_whole
 from msgs_spec.arrays import Array, Flags
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ
-from msgs_spec.text import one_of
+from msgs_spec.text import one_line, one_of
 
 # Gymnasium's value for episodes without a limit of steps.
 _NO_LIMIT = -1
@@ -119,9 +119,8 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
             dictionary.
 
         Raises:
-            TypeError: If the mask is no boolean array.
-            ValueError: If an option is unknown, mask or goal has another shape, a goal or a
-                seed is invalid or the number of seeds is wrong.
+            ValueError: If an option is unknown, a mask, goal or seed is invalid, or the number of
+                seeds is wrong.
             gymnasium.error.ResetNeeded: If the mask leaves out one that was never reset.
         """
         mask = self._reset_mask(options)
@@ -350,13 +349,13 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
         if not isinstance(options, dict) or 'reset_mask' not in options:
             return np.ones(self.num_envs, dtype=bool)
         mask = options['reset_mask']
-        if not isinstance(mask, np.ndarray) or mask.dtype != bool:
-            raise TypeError(f'reset_mask is a boolean array, not {mask!r}')
-        if mask.shape != (self.num_envs,):
-            raise ValueError(f'reset_mask has shape ({self.num_envs},), not {mask.shape}')
-        if not mask.any():
-            raise ValueError('reset_mask names no environment; allowed: one or more')
-        return mask
+        is_array = isinstance(mask, np.ndarray) and mask.dtype == bool
+        if not is_array or mask.shape != (self.num_envs,) or not mask.any():
+            raise ValueError(
+                f'reset_mask {one_line(repr(mask), 60)}; allowed: an array of {self.num_envs} '
+                'booleans, at least one of them True'
+            )
+        return np.asarray(mask)
 
 
 _SETTABLE = ('reward_type', 'distance_threshold', 'rotation_threshold')

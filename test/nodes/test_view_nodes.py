@@ -38,7 +38,7 @@ from fetch_hand_sim.view.requests import (
 )
 from msgs_spec.codecs import decode, message_stamp
 from msgs_spec.tasks import task_spec
-from msgs_spec.topics import LATCHED, scalar_topics, topic, topics, view_topic
+from msgs_spec.topics import LATCHED, scalar_topics, topic, topics, view_topics
 from node_runtime.event_loop import EventLoop
 from node_runtime.ros import rclpy_profile, ros_message_class
 from support.episode_recorder import Recorder
@@ -401,7 +401,7 @@ def watch_everything(connection: Client) -> dict[str, set[int]]:
         pass
 
     def subscribe(name: str) -> None:
-        source = view_topic(REACH, name)
+        source = {each.name: each for each in view_topics(REACH)}[name]
 
         def keep(message: Any) -> None:
             (first, *_) = getattr(message, 'markers', [message])
