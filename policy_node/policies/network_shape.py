@@ -1,4 +1,4 @@
-"""The shape of an actor's network, and the `predict` of all that have one."""
+"""The shape of an actor's network, and the `predict` that all implementations share."""
 
 from __future__ import annotations
 

@@ -111,51 +111,6 @@ _MEASURED = 256
 _FIRST_SCALE = 0.05
 
 
-class ParameterNoise:
-    """Noise on the weights of the actor, constant within an episode (arXiv 1706.01905).
-
-    The scale adapts to the distance by which the noise moves actions. After every cycle it is
-    multiplied by wanted / measured distance, at most by 2 or 1/2. The paper takes steps of 1 %,
-    which is too slow for a few dozen cycles of long episodes.
-
-    Attributes:
-        share: Factor on `distance`, 0 ... 1.
-    """
-
-    def __init__(self, generator: np.random.Generator, distance: float) -> None:
-        self._generator = generator
-        self._distance = distance
-        self.share = 1.0
-        self.scale = _FIRST_SCALE
-
-    def perturb(self, actor: Policy) -> PerturbedActors:
-        """Return copies of an actor, each with other weights."""
-        assert isinstance(actor, Actor)
-        return PerturbedActors([self._copy(actor) for _ in range(_COPIES)])
-
-    @torch.no_grad()
-    def _copy(self, actor: Actor) -> Actor:
-        perturbed = copy.deepcopy(actor)
-        for parameter in perturbed.network.parameters():
-            noise = self._generator.standard_normal(tuple(parameter.shape), dtype=np.float32)
-            parameter.add_(torch.from_numpy(noise), alpha=self.scale)
-        return perturbed
-
-    def adapt(self, actor: Policy, perturbed: Policy, states: Mapping[str, ArrayLike]) -> None:
-        """Adapt the scale to the distance between the actions of the copies and of the actor.
-
-        Args:
-            states: Observations (states, ...) of the last cycle.
-        """
-        count = len(np.asarray(states['observation']))
-        chosen = self._generator.choice(count, min(count, _MEASURED), replace=False)
-        at = {name: np.asarray(values)[chosen] for name, values in states.items()}
-        moved = perturbed.predict(at)[0] - actor.predict(at)[0]
-        distance = float(np.sqrt(np.square(moved).mean()))
-        wanted = self.share * self._distance
-        self.scale *= float(np.clip(wanted / max(distance, 1e-6), 0.5, 2.0))
-
-
 class PerturbedActors:
     """Actors that each act for their share of the rows."""
 
@@ -182,20 +137,38 @@ class PerturbedActors:
 
 
 class PerturbingCollector(Collector):
-    """Noise on weights instead of noise on actions; arguments as `Collector`."""
+    """Noise on the weights of the actor, constant within an episode (arXiv 1706.01905).
+
+    The scale adapts to the distance by which the noise moves actions. After every cycle it is
+    multiplied by wanted / measured distance, at most by 2 or 1/2. The paper takes steps of 1 %,
+    which is too slow for a few dozen cycles of long episodes. Arguments as `Collector`.
+    """
 
     def __init__(self, simulation: Simulation, seeds: list[int], config: TrainConfig) -> None:
         super().__init__(simulation, seeds, config)
-        self._parameters = ParameterNoise(self._generator, config.noise_std)
+        self._distance, self._scale = config.noise_std, _FIRST_SCALE
 
     def _begin(self, policy: Policy) -> Policy:
-        self._parameters.share = self.exploration
-        return self._parameters.perturb(super()._begin(policy))
+        actor = super()._begin(policy)
+        assert isinstance(actor, Actor)
+        return PerturbedActors([self._copy(actor) for _ in range(_COPIES)])
+
+    @torch.no_grad()
+    def _copy(self, actor: Actor) -> Actor:
+        perturbed = copy.deepcopy(actor)
+        for parameter in perturbed.network.parameters():
+            noise = self._generator.standard_normal(tuple(parameter.shape), dtype=np.float32)
+            parameter.add_(torch.from_numpy(noise), alpha=self._scale)
+        return perturbed
 
     def _end(self, policy: Policy, acting: Policy, episodes: Episodes) -> None:
-        ticks = episodes.ticks
+        count, ticks = len(episodes) * episodes.ticks, episodes.ticks
+        chosen = self._generator.choice(count, min(count, _MEASURED), replace=False)
         states = {
-            'observation': episodes.observation[:, :-1].reshape(len(episodes) * ticks, -1),
-            'desired_goal': np.repeat(episodes.desired_goal, ticks, axis=0),
+            'observation': episodes.observation[:, :-1].reshape(count, -1)[chosen],
+            'desired_goal': episodes.desired_goal[chosen // ticks],
         }
-        self._parameters.adapt(policy, acting, states)
+        moved = acting.predict(states)[0] - policy.predict(states)[0]
+        distance = float(np.sqrt(np.square(moved).mean()))
+        wanted = self.exploration * self._distance
+        self._scale *= float(np.clip(wanted / max(distance, 1e-6), 0.5, 2.0))

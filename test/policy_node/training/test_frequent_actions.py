@@ -17,7 +17,6 @@ from policy_node.training.learners.ddpg import DDPG
 from policy_node.training.machine import Workers
 from policy_node.training.research.frequent_actions import (
     HoldingSampler,
-    ParameterNoise,
     length_of,
     plain_actor,
     ticks_of,
@@ -119,20 +118,17 @@ def test_noise_that_holds_for_40_ms_moves_the_gripper_as_at_25_hz() -> None:
     assert spread[1] / spread[0] == pytest.approx(np.sqrt(10.0), rel=0.35)
 
 
-def test_noise_on_weights_moves_actions_as_far_as_asked() -> None:
+def test_noise_on_weights_moves_actions_as_far_as_asked():
     torch.manual_seed(0)
-    actor, generator = Actor(NetworkShape(10, 3, 4, (64, 64))).eval(), np.random.default_rng(0)
-    noise = ParameterNoise(generator, distance=0.2)
-    states = {name: generator.normal(size=(400, n)) for name, n in (('observation', 10),)}
-    states['desired_goal'] = generator.normal(size=(400, 3))
-    own, _ = actor.predict(states)
+    actor = Actor(NetworkShape(10, 3, 4, (64, 64))).eval()
+    config = config_at(25.0, parameter_noise=True, noise_std=0.2, random_epsilon=0.0)
+    simulation = Simulation('FetchReach', num_envs=16, num_threads=1)
+    collector = make_collector(simulation, list(range(16)), config)
     for _ in range(8):
-        perturbed = noise.perturb(actor)
-        noise.adapt(actor, perturbed, states)
-    moved = np.sqrt(np.square(noise.perturb(actor).predict(states)[0] - own).mean())
-    assert moved == pytest.approx(0.2, rel=0.3)
-    np.testing.assert_array_equal(perturbed.predict(states)[0], perturbed.predict(states)[0])
-    np.testing.assert_array_equal(actor.predict(states)[0], own)
+        episodes, _ = collector.collect(actor)
+    goal = np.repeat(episodes.desired_goal[:, None], 50, axis=1)
+    own, _ = actor.predict({'observation': episodes.observation[:, :-1], 'desired_goal': goal})
+    assert np.sqrt(np.square(episodes.action - own).mean()) == pytest.approx(0.2, rel=0.3)
 
 
 def test_lengths_mean_ticks_and_ticks_lengths() -> None:
