@@ -81,8 +81,14 @@ class Watcher:
         """Name a process that would interact with the nodes of this demo, or return ''."""
         if count_publishers(self._node, 'episode_status'):
             return 'a robot'
-        if waiting := self._waiting_policies():
-            return min(waiting)
+        # Policies that wait for a robot read its status and report diagnostics.
+        listeners = self._node.get_subscriptions_info_by_topic('episode_status')
+        reporters = self._node.get_publishers_info_by_topic(DIAGNOSTICS.name)
+        waiting, reporting = (
+            {str(each.node_name) for each in endpoints} for endpoints in (listeners, reporters)
+        )
+        if found := (waiting & reporting) - {_NAMELESS}:
+            return min(found)
         # The nodes of this demo have not started yet.
         nodes = self._node.get_node_names_and_namespaces()
         if nodes.count(('demo', '/')) > 1:
@@ -90,15 +96,6 @@ class Watcher:
         commands = [each.name for each in topics(self._spec) if each.name.endswith('commands')]
         is_commanded = any(count_publishers(self._node, name) for name in commands)
         return 'a publisher of commands' if is_commanded else ''
-
-    def _waiting_policies(self) -> set[str]:
-        """Return the nodes that wait for a robot: they read its status and report diagnostics."""
-        listeners = self._node.get_subscriptions_info_by_topic('episode_status')
-        reporters = self._node.get_publishers_info_by_topic(DIAGNOSTICS.name)
-        waiting, reporting = (
-            {each.node_name for each in endpoints} for endpoints in (listeners, reporters)
-        )
-        return {name for name in waiting & reporting if name != _NAMELESS}
 
     def spin(self) -> None:
         """Serve callbacks for 50 ms at most."""

@@ -61,12 +61,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(options: argparse.Namespace) -> int:
-    from fetch_hand_sim.films.film import check_kind
+    from fetch_hand_sim.films.film import STILL, check_kind
 
     try:
         check_kind(options.out)
-        _check_is_used(options)
-        _render(options)
+        is_picture = options.out.suffix.lower() in STILL
+        if is_picture and options.speed is not None:
+            raise UsageError(
+                f'--speed is for films (.mp4, .gif, .webp); {options.out} is a picture'
+            )
+        if not is_picture and options.frame is not None:
+            raise UsageError(f'--frame is for pictures (.png, .jpg); {options.out} is a film')
+        _render(options, is_picture)
     except ValueError as error:
         raise UsageError(str(error)) from None
     except (RuntimeError, OSError) as error:
@@ -75,21 +81,8 @@ def _run(options: argparse.Namespace) -> int:
     return EXIT_SUCCESS
 
 
-def _check_is_used(options: argparse.Namespace) -> None:
-    """Raise UsageError for options that the kind of file ignores."""
-    from fetch_hand_sim.films.film import STILL
-
-    if options.out.suffix.lower() in STILL:
-        if options.speed is not None:
-            raise UsageError(
-                f'--speed is for films (.mp4, .gif, .webp); {options.out} is a picture'
-            )
-    elif options.frame is not None:
-        raise UsageError(f'--frame is for pictures (.png, .jpg); {options.out} is a film')
-
-
-def _render(options: argparse.Namespace) -> None:
-    from fetch_hand_sim.films.film import STILL, check_size, write_film, write_picture
+def _render(options: argparse.Namespace, is_picture: bool) -> None:
+    from fetch_hand_sim.films.film import check_size, write_film, write_picture
     from fetch_hand_sim.films.recording import (
         Recording,
         Studio,
@@ -111,7 +104,7 @@ def _render(options: argparse.Namespace) -> None:
     check_size(options.out, *sheet_size(len(recordings), columns, width, height))
     studio = Studio(width, height, options.camera)
     try:
-        if options.out.suffix.lower() in STILL:
+        if is_picture:
             draw = Studio.framed if options.grid else Studio.picture
             index = -1 if options.frame is None else options.frame
             stills = [draw(studio, recording, index) for recording in recordings]

@@ -13,7 +13,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Mapping
-from importlib.metadata import EntryPoint, PackageNotFoundError, distribution, entry_points
+from importlib.metadata import PackageNotFoundError, distribution, entry_points
 from typing import IO
 
 from node_runtime import signals
@@ -25,25 +25,16 @@ _PARENT = signals.__name__
 _SHUTDOWN_TIMEOUT = 10.0
 
 
-class UnknownExecutableError(UsageError):
-    """No executable has the given name; the message lists the installed ones."""
-
-
-def find_executable(name: str) -> EntryPoint:
-    """Return the entry point of an executable such as `sim_node`; UnknownExecutableError."""
-    try:
-        points = distribution(_DISTRIBUTION).entry_points.select(group='console_scripts')
-    except PackageNotFoundError:
-        raise UnknownExecutableError(f'{_DISTRIBUTION} is not installed: pip install .') from None
-    if name not in points.names:
-        known = ', '.join(sorted(points.names))
-        raise UnknownExecutableError(f'no executable {name!r}; installed: {known}')
-    return points[name]
-
-
 def executable(name: str, parent: int | None = None) -> list[str]:
-    """Return the command that runs an executable, which terminates when process `parent` does."""
-    point = find_executable(name)
+    """Return the command that runs an executable, which terminates when process `parent` does.
+
+    Raises:
+        UsageError: If this package runs from its sources and is not installed.
+    """
+    try:
+        point = distribution(_DISTRIBUTION).entry_points.select(group='console_scripts')[name]
+    except PackageNotFoundError:
+        raise UsageError(f'{_DISTRIBUTION} is not installed: pip install .') from None
     function = f'__import__({point.module!r}, fromlist=["_"]).{point.attr}'
     # Before slow imports.
     first = '' if parent is None else f'import {_PARENT}; {_PARENT}.end_with_parent({parent}); '

@@ -83,22 +83,17 @@ class Curves:
 
 
 class History:
-    """The newest tick of a running robot, its trail and its curves."""
+    """The newest tick of a running robot, its trail and its `curves`."""
 
     def __init__(self, spec: TaskSpec, metric: GoalMetric) -> None:
         self.spec = spec
         self.picture = Picture(spec.name)
-        self._curves = Curves(spec, metric)
+        self.curves = Curves(spec, metric)
         self._trail: deque[Array] = deque(maxlen=TRAIL_TICKS)
-
-    @property
-    def success_rule(self) -> str:
-        """The success rule of the curves."""
-        return self._curves.metric.success_rule
 
     def use_metric(self, metric: GoalMetric) -> None:
         """Begin new curves with another metric."""
-        self._curves = Curves(self.spec, metric)
+        self.curves = Curves(self.spec, metric)
 
     def begin_episode(self) -> None:
         """Forget the trail of the episode before."""
@@ -107,9 +102,9 @@ class History:
     def add(self, stamp_ns: int, frame: Frame, reward: float | None, command: Array | None) -> None:
         """Append a tick; curves begin again if its time is before the last one."""
         if stamp_ns < self.picture.stamp_ns:
-            self.use_metric(self._curves.metric)
+            self.use_metric(self.curves.metric)
         self._trail.append(tracked_position(frame))
-        self._curves.add(stamp_ns * 1e-9, frame, reward, command)
+        self.curves.add(stamp_ns * 1e-9, frame, reward, command)
         self.picture = Picture(
             self.spec.name, frame, stamp_ns, trail=tuple(self._trail), command=command
         )
@@ -119,7 +114,3 @@ class History:
         if self.picture.frame is not None:
             frame = replace(self.picture.frame, desired_goal=goal)
             self.picture = replace(self.picture, frame=frame)
-
-    def graphs(self) -> Graphs:
-        """Return copies of the curves."""
-        return self._curves.graphs()

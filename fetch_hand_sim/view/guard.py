@@ -8,10 +8,8 @@ from __future__ import annotations
 
 import hmac
 import math
-import secrets
 import time
 from collections.abc import Awaitable, Callable, Sequence
-from dataclasses import dataclass
 from http.cookies import CookieError, SimpleCookie
 from ipaddress import ip_address
 from typing import Any
@@ -96,19 +94,6 @@ def is_loopback(host: str) -> bool:
         return False
 
 
-def new_token() -> str:
-    """Return a new secret for the address of the page."""
-    return secrets.token_urlsafe(16)
-
-
-@dataclass(frozen=True, slots=True)
-class Refusal:
-    """HTTP status and reason of a rejected request."""
-
-    status: int
-    reason: str
-
-
 class Guard:
     """Accepts or rejects requests.
 
@@ -124,36 +109,36 @@ class Guard:
         self.token = token
         self._cookie = _COOKIE.format(port=port)
 
-    def refusal(self, target: str, headers: Headers) -> Refusal | None:
-        """Return why a request for `target` (path and query) is rejected, or None."""
+    def refusal(self, target: str, headers: Headers) -> Response | None:
+        """Return the answer to a rejected request for `target` (path and query), or None."""
         try:
             path = urlsplit(target).path
         except ValueError:
-            return Refusal(400, 'this is no address')
+            return _answer(400, 'this is no address')
         if path in _FORBIDDEN_PATHS:
-            return Refusal(403, 'this page takes no files')
+            return _answer(403, 'this page takes no files')
         hosts = headers.get_all('Host')
         if len(hosts) != 1:
-            return Refusal(400, 'one Host header is needed')
+            return _answer(400, 'one Host header is needed')
         if self.token is None:
             if not is_loopback(_host_name(hosts[0])):
-                return Refusal(403, 'this page is served to this machine only')
+                return _answer(403, 'this page is served to this machine only')
         elif not self._has_token(target, headers):
-            return Refusal(403, 'the address lacks its token')
+            return _answer(403, 'the address lacks its token')
         if path in _SOCKETS and not _is_same_origin(headers.get_all('Origin'), hosts[0]):
-            return Refusal(403, 'only the page itself may connect')
+            return _answer(403, 'only the page itself may connect')
         return None
 
     def admission(self, target: str) -> str | None:
         """Return the cookie for a visitor with the token in the address, or None."""
-        if self.token is None or not self._matches(parse_qs(urlsplit(target).query).get('token')):
+        if self.token is None or not self._matches(_tokens_in(target)):
             return None
         # Strict cookies are not sent after a link on another site. Only web sockets can command,
         # and they need the page's origin too.
         return f'{self._cookie}={self.token}; Path=/; HttpOnly; SameSite=Lax'
 
     def _has_token(self, target: str, headers: Headers) -> bool:
-        given = parse_qs(urlsplit(target).query).get('token', [])
+        given = _tokens_in(target)
         for line in headers.get_all('Cookie'):
             try:
                 cookies = SimpleCookie(line)
@@ -163,10 +148,14 @@ class Guard:
                 given.append(cookies[self._cookie].value)
         return self._matches(given)
 
-    def _matches(self, given: Sequence[str] | None) -> bool:
+    def _matches(self, given: Sequence[str]) -> bool:
         # Invalid UTF-8 arrives as lone surrogates.
-        words = [each.encode('utf-8', 'surrogatepass') for each in given or ()]
+        words = [each.encode('utf-8', 'surrogatepass') for each in given]
         return any(hmac.compare_digest(each, (self.token or '').encode()) for each in words)
+
+
+def _tokens_in(target: str) -> list[str]:
+    return parse_qs(urlsplit(target).query).get('token', [])
 
 
 def _host_name(host: str) -> str:
@@ -203,7 +192,7 @@ def guarded_serve(
         def check(connection: Any, request: Request) -> Response | None:
             refusal = guard.refusal(request.path, request.headers)
             if refusal is not None:
-                return _answer(refusal.status, refusal.reason)
+                return refusal
             cookie = guard.admission(request.path)
             if cookie is not None:
                 # Redirect, so that the address with the token is not copied by accident.
@@ -248,31 +237,25 @@ def _attended(handler: Any, attendance: Attendance) -> Callable[[Any], Awaitable
         if urlsplit(connection.request.path).path != _IN_CONTROL:
             await handler(connection)
             return
-        heard = _note_input(connection, attendance)
+        receive, has_sent = connection.recv, False
+
+        # Iteration over the connection calls `recv` too.
+        async def recv(*arguments: Any, **options: Any) -> Any:
+            nonlocal has_sent
+            message = await receive(*arguments, **options)
+            has_sent = True
+            attendance.note()
+            return message
+
+        connection.recv = recv
         try:
             await handler(connection)
         finally:
             # A second browser is rejected before it sends anything: it was never in control.
-            if heard():
+            if has_sent:
                 attendance.end_visit()
 
     return handle
-
-
-def _note_input(connection: Any, attendance: Attendance) -> Callable[[], bool]:
-    """Record input of a connection; return a function with the result "has sent input"."""
-    receive, has_received = connection.recv, False
-
-    # Iteration over the connection calls `recv` too.
-    async def recv(*arguments: Any, **options: Any) -> Any:
-        nonlocal has_received
-        message = await receive(*arguments, **options)
-        has_received = True
-        attendance.note()
-        return message
-
-    connection.recv = recv
-    return lambda: has_received
 
 
 def _answer(status: int, text: str, headers: dict[str, str] | None = None) -> Response:

@@ -25,7 +25,6 @@ from fetch_hand_sim.view.robot_watch import (
     status_publishers,
 )
 from fetch_hand_sim.view.web import FOLLOWING, OVERLOOKING
-from msgs_spec.arrays import Array
 from msgs_spec.codecs import decode_status
 from msgs_spec.tasks import TaskSpec, task_spec
 from msgs_spec.tick import EpisodeStatus
@@ -112,7 +111,7 @@ class LiveRobot:
             commander=commander,
             actors=(spec.name, 'random', 'resting') if self._requests.has_policy else (),
         )
-        return dataclasses.replace(history.picture, graphs=history.graphs(), facts=facts)
+        return dataclasses.replace(history.picture, graphs=history.curves.graphs(), facts=facts)
 
     def perform(self, request: Request | LatestRequest) -> None:
         """Perform a request, unless the page may only watch."""
@@ -125,13 +124,11 @@ class LiveRobot:
             self._update_facts(notice='the robot is silent: the sliders cannot command it')
             return
         self._requests.perform(request)
-        if isinstance(request, SetGoal) and self._requests.fits(request):
-            self._show_goal(request.values)
-
-    def _show_goal(self, goal: Array) -> None:
-        """Show a goal at once: a robot that stands still publishes no tick with it."""
-        if self._history is not None and not self._facts.is_replay:
-            self._history.show_goal(goal)
+        history, is_replay = self._history, self._facts.is_replay
+        is_goal = isinstance(request, SetGoal) and self._requests.fits(request)
+        if is_goal and history is not None and not is_replay:
+            # At once: a robot that stands still publishes no tick with it.
+            history.show_goal(request.values)
             self._is_new = True
 
     def leave(self) -> None:
@@ -177,7 +174,7 @@ class LiveRobot:
         # A waiting robot has no episode yet.
         if known is None or known.spec.name != spec.name or status.phase == 'waiting':
             return History(spec, GoalMetric(spec, success_rule=rule))
-        if known.success_rule != rule:
+        if known.curves.metric.success_rule != rule:
             known.use_metric(GoalMetric(spec, success_rule=rule))
         return known
 
@@ -223,18 +220,15 @@ class LiveRobot:
         if replay is not None:
             self._follow_replay(replay.name)
         elif self.spec is not None and time.monotonic() - self._heard > _SILENCE:
-            self._notice_silence()
+            self._stop_commanding('the robot is silent: the sliders no longer command')
+            if not self._facts.is_silent:
+                self._update_facts(is_silent=True, is_paused=False, commander='', rate=0.0)
         self._end_notice()
         # `_update_facts` removes a name when the answer arrives.
         if 'speed' in self._unread:
             self._requests.read_speed()
         if 'actor' in self._unread:
             self._requests.read_actor()
-
-    def _notice_silence(self) -> None:
-        self._stop_commanding('the robot is silent: the sliders no longer command')
-        if not self._facts.is_silent:
-            self._update_facts(is_silent=True, is_paused=False, commander='', rate=0.0)
 
     def _end_notice(self) -> None:
         """Remove a notice of an earlier episode."""

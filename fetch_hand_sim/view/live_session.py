@@ -72,7 +72,10 @@ def _run(options: argparse.Namespace, stop: StopSignals) -> None:
         while not stop and all(process.poll() is None for process in nodes.values()):
             if attendance.has_left():
                 robot.leave()
-            _serve(session, frame_rate, loop)
+            is_new = session.update()
+            # Do not wait for messages: a robot in lockstep publishes thousands a second.
+            time.sleep(frame_rate.period() if is_new else _FRAME_TIME)
+            loop.serve_pending(_SERVED_FIRST)
 
 
 def attended(robot: LiveRobot, attendance: Attendance) -> Perform:
@@ -97,8 +100,9 @@ def _nodes(
     stop: StopSignals,
 ) -> Iterator[Nodes]:
     """Find a robot, or start one with its policy and stop both afterwards."""
-    timeout = DISCOVERY_TIME if options.task else options.wait
-    _wait_for_robot(robot, loop, stop, timeout)
+    end = time.monotonic() + (DISCOVERY_TIME if options.task else options.wait)
+    while robot.spec is None and not stop and time.monotonic() < end:
+        loop.wait(_FRAME_TIME)
     if robot.spec is not None:
         _check_is_wanted(options, robot.spec, node.get_namespace())
     if robot.spec is not None or stop:
@@ -115,12 +119,6 @@ def _nodes(
             finally:
                 for process in started.values():
                     stop_node(process)
-
-
-def _wait_for_robot(robot: LiveRobot, loop: EventLoop, stop: StopSignals, seconds: float) -> None:
-    end = time.monotonic() + seconds
-    while robot.spec is None and not stop and time.monotonic() < end:
-        loop.wait(_FRAME_TIME)
 
 
 def _check_is_wanted(options: argparse.Namespace, spec: TaskSpec, where: str) -> None:
@@ -156,7 +154,7 @@ def _start(options: argparse.Namespace, node: Node, log: IO[str]) -> Nodes:
         policy = 'random'
     settings: dict[str, object] = {'task': options.task, 'wait_for_commands': True}
     if options.episode_dir:
-        settings['episode_dir'] = str(Path(options.episode_dir))
+        settings['episode_dir'] = options.episode_dir
     if count_publishers(node, _CLOCK):
         print('/clock comes from another robot: this one does not publish it.', flush=True)
         settings['publish_clock'] = False
@@ -193,11 +191,3 @@ def _give_way() -> None:
     for thread in os.listdir('/proc/self/task'):
         with suppress(ProcessLookupError):
             os.setpriority(os.PRIO_PROCESS, int(thread), _NICENESS)
-
-
-def _serve(session: Session, frame_rate: FrameRate, loop: EventLoop) -> None:
-    """Show what is new, and wait for the time of one picture."""
-    is_new = session.update()
-    # Sleep instead of waiting for messages: a robot in lockstep publishes thousands a second.
-    time.sleep(frame_rate.period() if is_new else _FRAME_TIME)
-    loop.serve_pending(_SERVED_FIRST)

@@ -90,7 +90,7 @@ class Player:
         self._then = clock()
         self._notice = ''
         self._shown: tuple[object, ...] = ()
-        self._open_first()
+        self._open_first(range(len(paths)))
 
     @property
     def index(self) -> int:
@@ -138,10 +138,26 @@ class Player:
         last = len(self._recording.frames) - 1
         self._position = float(self._recording.times[min(max(index, 0), last)])
 
-    def _open_first(self) -> None:
-        """Open the first readable episode."""
+    def _change(self, by: int) -> None:
+        """Open the next readable episode. Without one, stay and set a notice."""
+        count = len(self._paths)
+        try:
+            self._open_first([(self._number + by * each) % count for each in range(1, count + 1)])
+        except EpisodeReadError as error:
+            self._notice = f'no episode can be read any more; {error}'
+
+    def _choose(self, number: int) -> None:
+        """Open an episode. If it is unreadable, stay and set a notice."""
+        if 0 <= number < len(self._paths):
+            try:
+                self._open(number)
+            except EpisodeReadError as error:
+                self._notice = str(error)
+
+    def _open_first(self, numbers: Sequence[int]) -> None:
+        """Open the first readable episode of these."""
         skipped: list[EpisodeReadError] = []
-        for number in range(len(self._paths)):
+        for number in numbers:
             try:
                 self._open(number)
             except EpisodeReadError as error:
@@ -152,29 +168,6 @@ class Player:
                 self._notice = f'skipped {skipped[0]}{more}'
             return
         raise none_readable(skipped)
-
-    def _change(self, by: int) -> None:
-        """Open the next readable episode. Without one, stay and set a notice."""
-        number, skipped = self._number, ''
-        for _ in self._paths:
-            number = (number + by) % len(self._paths)
-            try:
-                self._open(number)
-            except EpisodeReadError as error:
-                skipped = f'skipped {error}'
-                continue
-            self._notice = skipped
-            return
-        self._notice = f'no episode can be read any more; {skipped}'
-
-    def _choose(self, number: int) -> None:
-        """Open an episode. If it is unreadable, stay and set a notice."""
-        if not 0 <= number < len(self._paths):
-            return
-        try:
-            self._open(number)
-        except EpisodeReadError as error:
-            self._notice = str(error)
 
     def _open(self, number: int) -> None:
         self._recording = recording = load_recording(self._paths[number])

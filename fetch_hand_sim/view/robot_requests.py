@@ -245,13 +245,22 @@ class RobotRequests:
     def _control_time(self, request: SetPaused | StepOnce | Reset | SetSpeed) -> None:
         match request:
             case SetPaused():
-                self._pause(request.is_paused)
+                service = 'pause' if self._replay is None else self._replay[0].pause
+                paused = partial(self._tell, is_paused=request.is_paused)
+                self._time.call(service, PAUSE.type_name, paused, data=request.is_paused)
             case StepOnce():
                 self._sim.call('step', _TRIGGER)
-            case Reset():
-                self._reset(request.seed)
+            case Reset(seed=seed):
+                reset = partial(self._sim.call, 'reset', _TRIGGER)
+                if seed is None:
+                    reset()
+                else:
+                    # The seed is for the next episode, so set it before the reset.
+                    self._sim.set_parameter('seed', seed, reset)
             case SetSpeed():
-                self._set_speed(float(request.factor))
+                factor, name = float(request.factor), self._speed_name
+                taken = partial(self._tell, speed=factor, notice=f'{name}: {factor:g}')
+                self._time.set_parameter(name, factor, taken)
 
     def fits(self, request: Request | LatestRequest) -> bool:
         """Return whether a goal or command has the size that the current robot needs."""
@@ -277,23 +286,6 @@ class RobotRequests:
     @property
     def _speed_name(self) -> str:
         return 'real_time_factor' if self._replay is None else 'rate'
-
-    def _pause(self, is_paused: bool) -> None:
-        service = 'pause' if self._replay is None else self._replay[0].pause
-        paused = partial(self._tell, is_paused=is_paused)
-        self._time.call(service, PAUSE.type_name, paused, data=is_paused)
-
-    def _reset(self, seed: int | None) -> None:
-        reset = partial(self._sim.call, 'reset', _TRIGGER)
-        if seed is None:
-            reset()
-        else:
-            # The seed is for the next episode, so set it before the reset.
-            self._sim.set_parameter('seed', seed, reset)
-
-    def _set_speed(self, factor: float) -> None:
-        taken = partial(self._tell, speed=factor, notice=f'{self._speed_name}: {factor:g}')
-        self._time.set_parameter(self._speed_name, factor, taken)
 
     def _set_commanding(self, is_commanding: bool) -> None:
         self._is_commanding = is_commanding

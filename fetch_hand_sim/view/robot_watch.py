@@ -107,8 +107,7 @@ class RobotWatch:
     @property
     def spec(self) -> TaskSpec | None:
         """The robot's task; None before the first status."""
-        status = self.status
-        return task_spec(status.task, status.joint_prefix, status.control_hz) if status else None
+        return _spec_of(self.status) if self.status else None
 
     @property
     def joint_prefix(self) -> str:
@@ -127,8 +126,9 @@ class RobotWatch:
 
     def _on_status_message(self, message: Any) -> None:
         """Take a status from its own topic, unless `latest_tick` brings it."""
-        status = _read_status(message)
-        if status is None:
+        try:
+            status = _read_status(message)
+        except ValueError:
             return
         if self._is_other(status) or not self._takes_latest or status.phase == 'waiting':
             self._take_status(status)
@@ -139,7 +139,7 @@ class RobotWatch:
 
     def _take_status(self, status: EpisodeStatus) -> None:
         if self._is_other(status):
-            self._follow(task_spec(status.task, status.joint_prefix, status.control_hz))
+            self._follow(_spec_of(status))
         self.status = status
         self._on_status(status)
         if status.phase == 'reset':
@@ -155,8 +155,6 @@ class RobotWatch:
             }
             stamp_ns = given[_FIRST][0]
         except (KeyError, ValueError):
-            return
-        if status is None:
             return
         self._take_status(status)
         # Without subscriptions, this was the first status of another robot.
@@ -177,9 +175,8 @@ class RobotWatch:
         if not self._subscriptions and self._change is None:
             self._subscribe_to(spec)
             return
-        for subscription in self._subscriptions:
-            self._node.destroy_subscription(subscription)
-        self._subscriptions = []
+        while self._subscriptions:
+            self._node.destroy_subscription(self._subscriptions.pop())
         self._end_change()
         self._change = self._node.create_timer(
             _CHANGE_TIME, lambda: self._subscribe_to(spec), clock=self._clock
@@ -196,8 +193,9 @@ class RobotWatch:
         self._codecs = {name: TopicCodec(topic(spec, name)) for name in names}
         self._takes_latest = self._has_latest()
         if self._takes_latest:
-            latest = self.subscribe(LATEST_TICK, WATCHING, self._take_latest, raw=True)
-            self._subscriptions = [latest]
+            self._subscriptions = [
+                self.subscribe(LATEST_TICK, WATCHING, self._take_latest, raw=True)
+            ]
             return
         self._subscriptions = [
             self.subscribe(each.topic, _FOLLOWING, self._collector(each), raw=True)
@@ -244,14 +242,15 @@ class RobotWatch:
         self._on_tick(SeenTick(self._stamp_ns, frame, reward, command, status))
 
 
-def _read_status(message: Any) -> EpisodeStatus | None:
-    """Return the parsed `episode_status`; None if the task is unknown here."""
-    try:
-        status = EpisodeStatus.from_values(decode_status(message))
-        task_spec(status.task, status.joint_prefix, status.control_hz)
-    except ValueError:
-        return None
+def _read_status(message: Any) -> EpisodeStatus:
+    """Return the parsed `episode_status`; ValueError if the task is unknown here."""
+    status = EpisodeStatus.from_values(decode_status(message))
+    _spec_of(status)
     return status
+
+
+def _spec_of(status: EpisodeStatus) -> TaskSpec:
+    return task_spec(status.task, status.joint_prefix, status.control_hz)
 
 
 @dataclass(frozen=True, slots=True)

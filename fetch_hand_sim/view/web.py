@@ -7,6 +7,7 @@ import errno
 import http.client
 import logging
 import os
+import secrets
 import socket
 import sys
 import threading
@@ -30,7 +31,7 @@ from mujoco.studio.dear_imgui import dear_imgui as imgui
 from mujoco.studio.web import web_server
 from websockets.exceptions import ConnectionClosed
 
-from fetch_hand_sim.view.guard import Attendance, Guard, guarded_serve, is_loopback, new_token
+from fetch_hand_sim.view.guard import Attendance, Guard, guarded_serve, is_loopback
 from msgs_spec.topics import LATEST_TICKS_PER_SECOND
 from node_runtime.command_line import CommandError
 
@@ -206,7 +207,7 @@ def open_page(
     """
     listening = _listen(host, port)
     port = listening.getsockname()[1]
-    guard = Guard(None if is_loopback(host) else new_token(), port)
+    guard = Guard(None if is_loopback(host) else secrets.token_urlsafe(16), port)
     address = Address(host, port, guard.token, is_read_only)
     attendance = attendance or Attendance()
     _replace_server(listening, guarded_serve(guard, attendance, is_read_only))

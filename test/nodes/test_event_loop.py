@@ -32,18 +32,6 @@ def serve_until(loop: EventLoop, condition: Callable[[], bool]) -> None:
         loop.wait(0.01)
 
 
-def test_everything_that_waits_is_served_in_order(node):
-    received, publisher = collect(node)
-    loop = EventLoop(node)
-    loop.wait(0.1)  # takes the node's entities in
-    loop.wait(0.1)
-    for number in range(5):
-        publisher.publish(Float64(data=float(number)))
-    serve_until(loop, lambda: len(received) == 5)
-    assert received == [0.0, 1.0, 2.0, 3.0, 4.0]
-    loop.close()
-
-
 def test_no_more_than_the_limit_is_served_at_once(node):
     received, publisher = collect(node)
     loop = EventLoop(node)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import signal
 import time
 from pathlib import Path
@@ -316,11 +315,3 @@ def test_bad_parameters_end_with_one_line_and_code_2(start_process: Start) -> No
         assert code == 2, parameters
         assert line in output
         assert len(output.strip().splitlines()) == 1
-
-
-def test_policy_refuses_an_actor_of_another_task(start_process: Start) -> None:
-    start_process(*SIM_NODE, *ros_args(task='HandReach', mode='lockstep'))
-    policy = start_process(*POLICY_NODE, *ros_args(policy='FetchReach'))
-    code, output = finish(policy)
-    assert code == 1
-    assert re.search(r'FetchReach\.safetensors was trained on FetchReach, not on HandReach', output)

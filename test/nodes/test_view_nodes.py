@@ -171,14 +171,6 @@ def test_the_speed_is_the_one_of_the_robot_whoever_sets_it(start_process: Start)
         assert follower.picture.facts.has_speed
 
 
-def test_a_robot_in_lockstep_has_no_speed_to_choose(start_process: Start) -> None:
-    start_process(*SIM_NODE, *ros_args(task='FetchReach', mode='lockstep'))
-    start_process(*POLICY_NODE)
-    with client(REACH) as connection:
-        follower = Follower(connection)
-        follower.until(lambda p: p.facts.rate and not p.facts.has_speed, 'lockstep')
-
-
 def test_a_replay_is_told_from_a_robot_and_paused(start_process: Start, tmp_path: Path) -> None:
     path = Recorder('FetchReach').record(EpisodeDirectory(tmp_path))
     start_process(*VIEW_REPLAY, *ros_args(path=path, loop=True, rate=0.8))
@@ -243,21 +235,6 @@ def test_a_replay_of_any_name_in_any_namespace_is_paused(
         loop.close()
         node.destroy_node()
         rclpy.shutdown()
-
-
-def test_a_robot_that_does_not_answer_is_not_paused(start_process: Start) -> None:
-    robot = start_process(*SIM_NODE, *ros_args(task='FetchReach'))
-    with client(REACH) as connection:
-        follower = Follower(connection)
-        follower.until(lambda p: p.frame is not None and p.facts.rate > 0.0, 'picture')
-        robot.send_signal(signal.SIGSTOP)
-        connection.spin(0.3)
-        follower.robot.perform(SetPaused(True))
-        connection.spin(1.0)
-        follower.until(lambda p: True, 'picture')
-        assert not follower.picture.facts.is_paused
-        robot.send_signal(signal.SIGCONT)
-        follower.until(lambda p: p.facts.is_paused, 'pause')
 
 
 def set_parameter(connection: Client, node: str, name: str, value: float) -> None:

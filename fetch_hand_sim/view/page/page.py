@@ -155,7 +155,7 @@ class Page(plugin.ViewerPlugin):
         if delta.any():
             is_turning, ray = not imgui.GetIO().KeyShift, self._ray(place)
             goal = moved_goal(scene.spec, drag.goal, drag.handle, ray, is_turning, delta)
-            self._send(SetGoal(goal, is_kept=self._panels.keeps_goal))
+            self._send(SetGoal(goal, is_kept=self._panels.goal_panel.keeps_goal))
 
     def _ray(self, place: MousePlace) -> Ray:
         fovy = float(self.viewer.model.vis.global_.fovy)

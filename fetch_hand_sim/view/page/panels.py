@@ -8,6 +8,7 @@ from pathlib import Path
 from mujoco.studio.dear_imgui import dear_imgui as imgui
 
 from fetch_hand_sim.episode_log import EpisodeReadError, read_summary
+from fetch_hand_sim.view.page.goal_panel import GoalPanel
 from fetch_hand_sim.view.page.plots import draw_plots
 from fetch_hand_sim.view.page.robot_panel import RobotPanel
 from fetch_hand_sim.view.page.widgets import (
@@ -39,20 +40,19 @@ class Panels:
     Args:
         send: Called with the requests of the visitor.
         episodes: Episode files to choose from.
+
+    Attributes:
+        goal_panel: Sets the goal.
     """
 
     def __init__(self, send: Send, episodes: tuple[Path, ...] = ()) -> None:
         self._send = send
         self._windows = Windows()
-        self._robot_panel = RobotPanel(send)
+        self.goal_panel = GoalPanel(send)
+        self._robot_panel = RobotPanel(send, self.goal_panel)
         self._episode_list = EpisodeList(episodes, send)
         # Upper edge of the next window in the left column.
         self._below = 0.0
-
-    @property
-    def keeps_goal(self) -> bool:
-        """True if later episodes repeat the visitor's goals."""
-        return self._robot_panel.keeps_goal
 
     def draw(self, picture: Picture | None) -> None:
         """Draw everything for one frame."""

@@ -50,17 +50,12 @@ def introduction(spec: TaskSpec) -> str:
 class RobotPanel:
     """The panel of the robot, with the input of the visitor."""
 
-    def __init__(self, send: Send) -> None:
+    def __init__(self, send: Send, goal_panel: GoalPanel) -> None:
         self._send = send
         self._seed = 0
-        self._goal_panel = GoalPanel(send)
+        self._goal_panel = goal_panel
         self._command_panel = CommandPanel(send)
         self._push_panel = PushPanel(send)
-
-    @property
-    def keeps_goal(self) -> bool:
-        """True if later episodes repeat the visitor's goals."""
-        return self._goal_panel.keeps_goal
 
     def draw(self, spec: TaskSpec, picture: Picture) -> None:
         """Draw the content of the panel."""

@@ -9,12 +9,7 @@ import sys
 
 import pytest
 
-from fetch_hand_sim.commands.node_processes import (
-    UnknownExecutableError,
-    executable,
-    find_executable,
-    is_actor_shipped,
-)
+from fetch_hand_sim.commands.node_processes import executable, is_actor_shipped
 
 
 def test_an_executable_runs_with_its_arguments_and_exit_code(tmp_path):
@@ -61,11 +56,6 @@ def test_an_executable_whose_parent_has_ended_does_not_start(tmp_path):
     for parent, code in ((os.getpid(), 0), (os.getppid(), -signal.SIGTERM)):
         command = [*executable('fetch_hand_sim', parent), 'episodes', 'list', tmp_path]
         assert subprocess.run(command, capture_output=True).returncode == code
-
-
-def test_an_unknown_executable_is_named_with_the_installed_ones():
-    with pytest.raises(UnknownExecutableError, match=r"no executable 'sim'; installed: .*sim_node"):
-        find_executable('sim')
 
 
 def test_shipped_actors_are_found_by_task():

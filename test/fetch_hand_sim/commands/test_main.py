@@ -11,14 +11,6 @@ import pytest
 from fetch_hand_sim.__main__ import COMMANDS, main, ros_arguments
 
 
-def test_options_and_exit_code_of_a_subcommand(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(sys, 'argv', [])
-    assert main(['episodes', 'list', str(tmp_path), '--task', 'FetchPush']) == 0
-    assert capsys.readouterr().out.startswith('0 episodes')
-    assert main(['episodes', 'list', str(tmp_path / 'none')]) == 2
-    assert capsys.readouterr().err.startswith('fetch_hand_sim episodes list: ')
-
-
 @pytest.mark.parametrize('arguments', [[], ['--help'], ['episodes'], ['episodes', '--help']])
 def test_without_a_command_help_is_printed(arguments, capsys):
     with pytest.raises(SystemExit) as caught:

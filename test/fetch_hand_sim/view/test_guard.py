@@ -32,7 +32,7 @@ def test_this_machine_is_served(host):
 
 @pytest.mark.parametrize('host', ['evil.example', '192.168.0.7:8080', 'localhost.evil.example', ''])
 def test_a_name_that_points_here_is_not(host):
-    assert refusal(Guard(), '/', Host=host).status == 403
+    assert refusal(Guard(), '/', Host=host).status_code == 403
 
 
 @pytest.mark.parametrize('path', ['/ui', '/state', '/state?sid=1'])
@@ -44,24 +44,24 @@ def test_a_web_socket_of_another_site_is_refused(path, origin, token):
     headers = {'Host': 'localhost:8080', 'Cookie': f'fetch_hand_sim_view_0={TOKEN}'}
     if origin is not None:
         headers['Origin'] = origin
-    assert refusal(Guard(token), path, **headers).status == 403
+    assert refusal(Guard(token), path, **headers).status_code == 403
 
 
 @pytest.mark.parametrize('headers', [[], [('Host', 'localhost'), ('Host', 'evil.example')]])
 def test_one_host_is_needed(headers):
-    assert Guard().refusal('/', Headers(headers)).status == 400
+    assert Guard().refusal('/', Headers(headers)).status_code == 400
 
 
 @pytest.mark.parametrize('token', [None, TOKEN])
 @pytest.mark.parametrize('target', ['//[', 'http://[::1/', '//a[b]c/?token=a-token'])
 def test_what_is_no_address_is_refused(target, token):
     """A traceback on the terminal of the robot would be a visitor's to make."""
-    assert refusal(Guard(token), target, Host='localhost').status == 400
+    assert refusal(Guard(token), target, Host='localhost').status_code == 400
 
 
 def test_no_files_from_visitors():
     headers = {'Host': 'localhost', 'Origin': 'http://localhost'}
-    assert refusal(Guard(), '/drop?sid=1', **headers).status == 403
+    assert refusal(Guard(), '/drop?sid=1', **headers).status_code == 403
 
 
 @pytest.mark.parametrize(
@@ -76,7 +76,7 @@ def test_no_files_from_visitors():
     ],
 )
 def test_without_the_token_nobody_is_served(target, cookie):
-    assert refusal(Guard(TOKEN), target, Host='robot.example', Cookie=cookie).status == 403
+    assert refusal(Guard(TOKEN), target, Host='robot.example', Cookie=cookie).status_code == 403
     assert Guard(TOKEN).admission(target) is None
 
 

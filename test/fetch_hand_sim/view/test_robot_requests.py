@@ -161,6 +161,6 @@ def test_the_page_says_of_a_robot_that_it_is_gone(is_silent, monkeypatch):
     monkeypatch.setattr(robot_panel, 'imgui', Choice())
     monkeypatch.setattr(robot_panel, 'say', said.append)
     facts = Facts(may_command=False, is_silent=is_silent)
-    robot_panel.RobotPanel(None).draw(SPEC, Picture(SPEC.name, facts=facts))
+    robot_panel.RobotPanel(None, None).draw(SPEC, Picture(SPEC.name, facts=facts))
     assert any('--read-only' in line for line in said)
     assert any('The robot is silent' in line for line in said) is is_silent

@@ -167,4 +167,8 @@ def test_the_page_says_so_when_nothing_is_heard_of_a_robot_any_more(node, monkey
     facts = facts_after(lambda: None, lambda facts: facts.is_silent)
     assert (facts.is_silent, facts.rate, facts.commander) == (True, 0.0, '')
     # It is heard again.
-    assert is_told(facts_after(lambda: robot.report(REPORT), is_told))
+    facts = facts_after(lambda: robot.report(REPORT), is_told)
+    assert is_told(facts) and facts.has_speed
+    lockstep = REPORT | {'mode': 'lockstep'}
+    facts = facts_after(lambda: robot.report(lockstep), lambda facts: not facts.has_speed)
+    assert not facts.has_speed
