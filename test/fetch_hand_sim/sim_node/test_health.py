@@ -187,6 +187,9 @@ def test_a_report_that_came_late_is_followed_by_a_whole_period():
 @pytest.mark.parametrize('mode', ['realtime', 'lockstep'])
 def test_commands_are_not_missing_during_a_pause(make, mode):
     case = make(mode)
+    report = Health(case.robot, '/sim_node', case.clock.now).report(FINE, 101.0)
+    # The page offers no speed in lockstep.
+    assert report.values['mode'] == mode
     case.robot.tick_when_due()
     case.robot.buffer.accept([0.0] * 4)
     case.robot.tick_when_due()
