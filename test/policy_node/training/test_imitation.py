@@ -15,6 +15,7 @@ from policy_node.training.runs.imitation import Answers, ImitationTrainer
 from policy_node.training.runs.initial_networks import read_initial_networks
 from policy_node.training.runs.run_log import read_progress
 from policy_node.training.train_her import main
+from support.runs import options_of
 
 torch.set_num_threads(1)
 LATE = '{"action": {"latency": 1}}'
@@ -74,13 +75,13 @@ def test_the_newest_answers_are_kept():
 
 def test_a_run_writes_a_policy_with_past_actions(tmp_path):
     run = tmp_path / 'run'
-    arguments = ['--task', 'FetchReach', '--recipe', 'robust', '--steps', '6400']
-    small = ['--set', 'updates_per_cycle=10', '--set', 'evaluation_episodes=64']
+    arguments = ['--task', 'FetchReach', '--recipe', 'robust', '--steps', '1600']
+    small = options_of(updates_per_cycle=10, evaluation_episodes=16, num_envs=16)
     assert main([*arguments, *small, '--threads', '1', '--output', str(run)]) == 0
     actor, info = checkpoint.load(run / 'best.safetensors')
     assert (info.past_actions, info.init_from['name']) == (4, 'FetchReach')
     assert actor.shape.past_actions == 4
-    assert read_progress(run / 'progress.csv')[-1]['eval_success'] > 0.9
+    assert read_progress(run / 'progress.csv')[-1]['eval_success'] > 0.7
     state = actor.predict({'observation': np.zeros(10), 'desired_goal': np.zeros(3)})[1]
     assert state is not None
 

@@ -27,7 +27,7 @@ from policy_node.training.runs.trainer import Trainer
 from policy_node.training.runs.training_state import part_of
 from policy_node.training.ship_actor import main as ship_actor
 from policy_node.training.train_her import main
-from support.runs import SMALL, one_line, options_of, same
+from support.runs import SMALL, one_line, options_of, same, small
 
 # One cycle of two simulations.
 TINY = SMALL | {'num_envs': 2, 'updates_per_cycle': 3, 'batch_size': 32, 'evaluation_episodes': 2}
@@ -264,7 +264,7 @@ def test_networks_whose_tensors_do_not_fit_are_one_line(tmp_path, block_run, cap
 
 def test_normalisers_of_an_actor_continue_with_its_statistics(tmp_path):
     networks = read_initial_networks('FetchReach')
-    trainer = start(tmp_path, recipe_config('FetchReach', 'best'), networks)
+    trainer = start(tmp_path, small(), networks)
     before = {name: value.clone() for name, value in trainer.learner.actor.state_dict().items()}
     actor = trainer.learner.actor
     trainer.experience.normalize(trainer.collector.collect(actor)[0], actor)
