@@ -643,6 +643,12 @@ def test_actions_beyond_the_range_are_clipped_as_on_the_robot(tmp_path, monkeypa
     assert (episode.commands == 1.0).all()
 
 
+def test_equal_command_lines_give_equal_messages(tmp_path):
+    runs = [generate(tmp_path / name, 'FetchReach', episodes=2) for name in ('a', 'b')]
+    for first, second in zip(*runs, strict=True):
+        assert read_episode(first).topics == read_episode(second).topics
+
+
 def test_arrays_are_as_documented(reach):
     (arrays, *_) = load_episodes(reach)
     names = {field.name for field in dataclasses.fields(arrays)}
