@@ -20,9 +20,11 @@ from msgs_spec.topics import MONITORING, SERVICES, QosSpec, TopicSpec, topics, v
 START, END = '<!-- interface table -->', '<!-- /interface table -->'
 
 _PUBLISHING = (
-    'All messages of a tick carry one stamp. `reward` and `applied_command` start with the first\n'
-    'step of an episode; `episode_status` is sent at the first and the last tick of an episode,\n'
-    'and while the robot waits for its first; `desired_goal` every tick.'
+    'All messages of a tick that have a header carry one stamp; simulated time starts at 1 s.\n'
+    '`reward` and `applied_command` start with the first step of an episode; `episode_status` is\n'
+    'sent at the first and the last tick of an episode, and while the robot waits for its first\n'
+    'command; `desired_goal` every tick. `joint_states` has as many positions as velocities and\n'
+    'efforts.'
 )
 _VIEWING = (
     'None of them is logged. The scalars of a tick carry its stamp, for plots: '
@@ -155,8 +157,9 @@ def _orders() -> str:
         f'`joint_states` of a Fetch: {_names(FETCH.joints)}.',
         f'`joint_states` of a hand: {_names(SHADOW_HAND.joints)}.',
         f'Fingertips: {_names(FINGERTIPS)}.',
-        f'Keys of `episode_status`: {_names(keys)}. `joint_prefix`, `disturbances` and '
-        '`variation` are left out if they have their defaults.',
+        f'Keys of `episode_status`: {_names(keys)}. Values are text; booleans are `True` and '
+        '`False`. `joint_prefix`, `disturbances` and `variation` are left out if they have '
+        'their defaults.',
         f'`phase`: {", ".join(f"`{phase}` {when}" for phase, when in PHASES.items())}.',
     )
     values = '\n'.join(f'- {line}' for line in lines)
