@@ -164,7 +164,7 @@ def test_a_critic_with_another_norm_starts_from_random_weights(tmp_path, block_r
     arguments = ['--task', task, '--steps', '200', *SET, '--set=norm=layer']
     assert main([*arguments, '--init-from', str(block_run), '--output', str(run)]) == 0
     on = read_initial_networks(str(run))
-    assert on.fitted(config).critics and not on.fitted(tiny(task)).has_critic
+    assert on.fitted(config).critics and not on.fitted(tiny(task)).critics
 
 
 def test_without_targets_a_run_starts_from_the_networks_themselves(tmp_path, block_run):
