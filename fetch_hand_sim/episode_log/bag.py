@@ -21,6 +21,7 @@ from fetch_hand_sim.episode_log.records import (
     MAX_MAP_ENTRIES,
     MAX_MESSAGES,
     MAX_METADATA_BYTES,
+    MAX_TOPICS,
     MAX_UNPACKED_BYTES,
 )
 from msgs_spec.schemas import MAX_MESSAGE_BYTES, schema_text, type_hash
@@ -194,6 +195,8 @@ class BagFile:
         return _dump({'rosbag2_bagfile_information': self._description(custom_data)})
 
     def _add_channel(self, name: str, topic: TopicSpec) -> _Channel:
+        if len(self._channels) == MAX_TOPICS:
+            raise OSError(errno.EFBIG, f'an episode has at most {MAX_TOPICS} topics')
         text, qos = schema_text(topic.type_name), offered_qos_text(topic.qos)
         texts = (name, topic.type_name, text, qos, type_hash(topic.type_name))
         self._bytes += 4 * 64 + sum(len(each.encode()) for each in texts)

@@ -106,8 +106,10 @@ def _refusal(hook: str) -> str:
     )
 
 
-def _camera(task: str, changes: Mapping[str, Any] | None) -> dict[str, Any]:
-    return {**CAMERAS[task_spec(task).robot.name], **(changes or {})}
+def _pictures(task: str, camera: Mapping[str, Any] | None) -> dict[str, Any]:
+    """Return the reference's size and view, with changes to its camera."""
+    view = {**CAMERAS[task_spec(task).robot.name], **(camera or {})}
+    return {'width': SIZE, 'height': SIZE, 'default_camera_config': view}
 
 
 def as_reference(reward: Any, reward_type: str) -> Any:
@@ -140,9 +142,8 @@ class RobotEnv(FetchHandEnv, GoalEnv):
             if hasattr(self, name):
                 raise TypeError(_refusal(name))
         self._mujoco_renderer: Any = None
-        self._camera = _camera(task, default_camera_config)
-        pictures: dict[str, Any] = {'width': SIZE, 'height': SIZE}
-        pictures['default_camera_config'] = self._camera
+        pictures = _pictures(task, default_camera_config)
+        self._camera = pictures['default_camera_config']
         super().__init__(task, **pictures | arguments)
         physics = self.simulation.task
         self._target_sites = _sites(physics.model, 'target')
@@ -498,8 +499,7 @@ class GymnasiumRoboticsVectorEnv(FetchHandVectorEnv):
             task = task_with_goals(task, target_position, target_rotation)
         elif target_position is not None or target_rotation is not None:
             raise TypeError(f'{task} takes neither target_position nor target_rotation')
-        camera = _camera(task, default_camera_config)
-        pictures: dict[str, Any] = {'width': SIZE, 'height': SIZE, 'default_camera_config': camera}
+        pictures = _pictures(task, default_camera_config)
         super().__init__(task, num_envs=num_envs, **pictures | arguments)
 
     def reset(

@@ -21,7 +21,7 @@ _TOLERANCE = 1e-9
 # Offset between two rows of readings, so that formulas cannot mix them up unnoticed.
 _OFFSET = 1e-6
 _STEPS = 3
-# Whether a rule is met, and the problem if it is not. Later rules rely on earlier ones.
+# Each rule yields whether it is met, and the problem otherwise. Later rules rely on earlier ones.
 Rules = Iterator[tuple[Any, str]]
 
 

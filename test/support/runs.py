@@ -64,7 +64,7 @@ def weights(file: Path) -> dict[str, torch.Tensor]:
 
 
 def same(first: dict[str, torch.Tensor], second: dict[str, torch.Tensor]) -> bool:
-    """Whether both have the same tensors."""
+    """Return whether both have the same tensors."""
     return first.keys() == second.keys() and all(torch.equal(first[n], second[n]) for n in first)
 
 

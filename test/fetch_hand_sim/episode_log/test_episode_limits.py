@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import pytest
 from mcap.writer import Writer
@@ -131,6 +132,14 @@ def test_an_episode_that_is_too_long_is_one_line_and_can_be_recovered(tmp_path, 
     assert writer.write_tick(10**15, messages) is False and writer.finish({}) is None
     (leftover,) = find_leftovers(tmp_path)
     assert read_summary(recover_episode(leftover.path)).message_count == limits.MAX_MESSAGES
+
+
+def test_more_topics_than_readers_accept_are_one_line(tmp_path, ticks):
+    writer = EpisodeWriter(tmp_path, 'episode', {})
+    spec, data = ticks[0].messages[0]
+    messages = [(replace(spec, name=f'topic_{i}'), data) for i in range(limits.MAX_TOPICS + 1)]
+    with pytest.raises(EpisodeLogError, match='at most 64 topics'):
+        writer.write_tick(1, messages)
 
 
 def test_the_smallest_chunks_read_too(tmp_path, recorder, ticks, monkeypatch):

@@ -222,7 +222,7 @@ def test_a_leftover_without_readable_messages_is_put_aside(finished, tmp_path, d
     leftover.mkdir()
     data = bytearray((finished / f'{finished.name}_0.mcap').read_bytes())
     if damage == 'length':
-        # That of the second record, after the header.
+        # The length of the second record, after the header.
         data[8 + 9 + int.from_bytes(data[9:17], 'little') + 7] ^= 1
     elif damage == 'magic':
         data[0] ^= 1

@@ -104,8 +104,10 @@ def test_a_refused_option_is_forgotten():
         ([{}, {'goal': [np.nan] * 3}], 'nan'),
     ):
         env.set_options(options)
+        before = env.batch.simulation.task.batch.state.copy()
         with pytest.raises(ValueError, match=line):
             env.reset()
+        assert np.array_equal(env.batch.simulation.task.batch.state, before)
         env.reset()
 
 

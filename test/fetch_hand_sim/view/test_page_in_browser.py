@@ -215,7 +215,7 @@ def robot_process(start_process):
 
 @pytest.fixture
 def robot(robot_process):
-    """A client of a robot that nobody commands and everybody may push."""
+    """A client of a robot without a commander; every visitor may push it."""
     with client(TASKS['FetchReach']) as connection:
         connection.subscribe(
             'desired_goal', 'episode_status', 'achieved_goal', 'applied_command', 'joint_states'
