@@ -144,7 +144,7 @@ torture: env
 		test/fetch_hand_sim/episode_log/test_episode_untrusted.py
 
 test-release: env
-	$(BIN)/python -m pytest -m 'release and alone' --timeout 1800 --durations 0
+	$(BIN)/python -m pytest -m 'release and alone' --reruns 1 --timeout 1800 --durations 0
 	$(BIN)/python -m pytest -m 'release and not alone' --reruns 1 -n 2 --dist loadfile --timeout 1800 --durations 0
 	PYTHON="$$(cd $(BIN) && pwd)/python" tools/test_release.sh
 

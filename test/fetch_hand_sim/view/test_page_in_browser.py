@@ -35,8 +35,9 @@ from support.graph import Client, client, ros_args
 
 pytestmark = [
     pytest.mark.skipif(find_browser() is None, reason='no Chromium: apt install chromium'),
-    # A browser is slow.
+    # A browser is slow, and slower beside other tests.
     pytest.mark.release,
+    pytest.mark.alone,
     pytest.mark.timeout(1500),
 ]
 
@@ -187,19 +188,28 @@ def headers(picture: np.ndarray) -> list[float]:
     return [41.0 + (start + end) / 2.0 for start, end in runs if 12 < end - start < 26]
 
 
-def open_section(browser: Browser, header: float, before: np.ndarray) -> None:
-    """Clicks a header until something else is below it; a page that is still busy may miss one."""
-    below = slice(round(header) + 12, round(header) + 32), slice(10, 340)
+def click_until(
+    browser: Browser, x: float, y: float, condition: Callable[[np.ndarray], bool], what: str
+) -> None:
+    """Clicks until the page looks as it should; a page that is still busy may miss a click."""
     for _ in range(3):
-        browser.click(120.0, header)
+        browser.click(x, y)
         end = time.monotonic() + PATIENCE / 6
         while time.monotonic() < end:
             browser.wait(1.0)
-            now = browser.screenshot()
-            if (np.abs(now[below].astype(int) - before[below]) > 8).mean() > 0.05:
+            if condition(picture := browser.screenshot()):
                 return
-    keep('without section', now)
-    raise AssertionError(f'nothing opens at {header}')
+    keep(f'without {what}', picture)
+    raise AssertionError(f'no {what} after clicks at {x}, {y}')
+
+
+def open_section(browser: Browser, header: float, before: np.ndarray) -> None:
+    below = slice(round(header) + 12, round(header) + 32), slice(10, 340)
+
+    def is_open(picture: np.ndarray) -> bool:
+        return bool((np.abs(picture[below].astype(int) - before[below]) > 8).mean() > 0.05)
+
+    click_until(browser, 120.0, header, is_open, 'section')
 
 
 SIM_NODE = (
@@ -268,10 +278,11 @@ def test_a_file_is_played_and_the_timeline_moves_it(browser, start_process, tmp_
     scene = np.s_[120:500, 350:600]
     browser.click(60.0, y)
     early = wait_until_still(browser, scene)
-    browser.click(880.0, y)
-    wait_for(
-        browser, lambda picture: difference(picture[scene], early[scene]) > 0.005, 'later frame'
-    )
+
+    def is_later(picture: np.ndarray) -> bool:
+        return difference(picture[scene], early[scene]) > 0.005
+
+    click_until(browser, 880.0, y, is_later, 'later frame')
 
 
 @contextmanager
