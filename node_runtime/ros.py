@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Iterable, MutableMapping
+from collections.abc import Callable, Iterable, MutableMapping
 from functools import cache
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from msgs_spec.topics import QosSpec
+from msgs_spec.topics import QosSpec, TopicSpec
 
 if TYPE_CHECKING:
     from rclpy.clock import Clock
     from rclpy.node import Node
     from rclpy.publisher import Publisher
     from rclpy.qos import QoSProfile
+    from rclpy.subscription import Subscription
 
 _UNKNOWN = '_NODE_NAME_UNKNOWN_'
 # Seconds to wait at shutdown until subscribers have the last messages.
@@ -71,6 +72,31 @@ def rclpy_profile(spec: QosSpec) -> QoSProfile:
         depth=spec.depth,
         reliability=QoSReliabilityPolicy.get_from_short_key(spec.reliability),
         durability=QoSDurabilityPolicy.get_from_short_key(spec.durability),
+    )
+
+
+def open_publisher(node: Node, spec: TopicSpec) -> Publisher:
+    """Return a new publisher of a topic."""
+    return node.create_publisher(
+        ros_message_class(spec.type_name), spec.name, rclpy_profile(spec.qos)
+    )
+
+
+def subscribe(
+    node: Node,
+    spec: TopicSpec,
+    callback: Callable[[Any], None],
+    *,
+    qos: QosSpec | None = None,
+    raw: bool = False,
+) -> Subscription:
+    """Subscribe to a topic, with the topic's own quality of service unless `qos` is given.
+
+    With `raw`, the callback gets the bytes of each message.
+    """
+    profile = rclpy_profile(qos or spec.qos)
+    return node.create_subscription(
+        ros_message_class(spec.type_name), spec.name, callback, profile, raw=raw
     )
 
 

@@ -45,8 +45,7 @@ from node_runtime.ros import (
     DISCOVERY_TIME,
     count_publishers,
     keep_discovery_local,
-    rclpy_profile,
-    ros_message_class,
+    subscribe,
 )
 
 _NAME = 'fetch_hand_sim demo'
@@ -72,10 +71,7 @@ class Watcher:
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self._node)
         for name, callback in (('episode_status', self._on_status), ('reward', self._on_reward)):
-            source = topic(spec, name)
-            self._node.create_subscription(
-                ros_message_class(source.type_name), name, callback, rclpy_profile(source.qos)
-            )
+            subscribe(self._node, topic(spec, name), callback)
 
     def others(self) -> str:
         """Name a process that would interact with the nodes of this demo, or return ''."""

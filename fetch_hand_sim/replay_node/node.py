@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +26,7 @@ from node_runtime.ros import (
     await_acknowledgements,
     count_publishers,
     full_name,
-    rclpy_profile,
-    ros_message_class,
+    open_publisher,
 )
 from node_runtime.ros_parameters import declare_parameters, set_callback
 
@@ -77,9 +77,7 @@ class ReplayNode(Node):
 
     def _open(self, name: str) -> Publisher:
         spec = self._schedule.topics[name]
-        return self.create_publisher(
-            ros_message_class(spec.type_name), self._name_here(name), rclpy_profile(spec.qos)
-        )
+        return open_publisher(self, replace(spec, name=self._name_here(name)))
 
     def _name_here(self, name: str) -> str:
         """Return the name under which this node publishes a recorded topic."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -28,19 +28,19 @@ class Endpoint:
 
 
 class InputWatch:
-    """Publishers of the topics that a robot subscribes to, and what is wrong with them."""
+    """Publishers of the topics that a robot subscribes to, and what is wrong with them.
 
-    def __init__(self, commands: Mapping[str, str], others: Mapping[str, str]) -> None:
+    Args:
+        types: The type of each topic.
+        commands: The topics of these that carry commands.
+    """
+
+    def __init__(self, types: Mapping[str, str], commands: Sequence[str]) -> None:
+        self.types = types
         self._commands = commands
-        self._types = {**commands, **others}
         self._endpoints: list[Endpoint] = []
         self._since: dict[bytes, float] = {}
         self._now = 0.0
-
-    @property
-    def topics(self) -> Iterable[str]:
-        """All watched topics."""
-        return self._types
 
     @property
     def commanders(self) -> list[str]:
@@ -85,7 +85,7 @@ class InputWatch:
 
     def _mismatch(self, endpoint: Endpoint) -> str:
         """Return why messages of a publisher never arrive, or ''."""
-        allowed = self._types[endpoint.topic]
+        allowed = self.types[endpoint.topic]
         if endpoint.type_name != allowed:
             return f'its type is {endpoint.type_name}; allowed: {allowed}'
         return '' if endpoint.is_reliable else 'it is best effort; allowed: reliable'
@@ -103,14 +103,15 @@ class GraphWatch:
 
     def __init__(self, node: Node, spec: TaskSpec, publishers: Mapping[str, Publisher]) -> None:
         self._node = node
-        received = [each for each in topics(spec) if each.direction == 'subscribed']
-        types = {node.resolve_topic_name(each.name): each.type_name for each in received}
-        commands = {
-            node.resolve_topic_name(each.name)
-            for each in received
-            if each.name.endswith('commands')
+        received = {
+            node.resolve_topic_name(each.name): each
+            for each in topics(spec)
+            if each.direction == 'subscribed'
         }
-        self.inputs = InputWatch({name: types[name] for name in commands}, types)
+        self.inputs = InputWatch(
+            {name: each.type_name for name, each in received.items()},
+            [name for name, each in received.items() if each.name.endswith('commands')],
+        )
         self.clock_publishers: list[str] = []
         self.robots: list[str] = []
         self.has_newcomer = False
@@ -119,7 +120,7 @@ class GraphWatch:
 
     def update(self) -> None:
         """Read the graph."""
-        found = [each for topic in self.inputs.topics for each in self._found(topic)]
+        found = [each for topic in self.inputs.types for each in self._found(topic)]
         if self.inputs.update(found, time.monotonic()):
             self.has_newcomer = True
             self._subscribers.expect_more()

@@ -1,13 +1,12 @@
-"""The health of a simulator node: a table of conditions, for `/diagnostics` and the log."""
+"""The health of a simulator node, for `/diagnostics` and the log."""
 
 from __future__ import annotations
 
-import time
 from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING
 
+from fetch_hand_sim.episodes.recorder import EpisodeRecorder
 from fetch_hand_sim.sim_node.graph_watch import GraphWatch
 from fetch_hand_sim.sim_node.robot import Messages, Robot
 from msgs_spec.codecs import TopicCodec
@@ -35,244 +34,69 @@ if TYPE_CHECKING:
 WAITING_PERIOD = 5.0
 # Share of the requested rate by which a healthy robot may be slower.
 _RATE_TOLERANCE = 0.05
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Surroundings:
-    """State of the graph and of the log.
-
-    Attributes:
-        commanders: Nodes that publish commands.
-        input_problems: One line for each publisher whose messages do not arrive, and for each
-            competing commander.
-        robots: Nodes that publish the topics of this robot, this one included.
-        waiting_elsewhere: One line for each policy that waits in another namespace.
-        clock_publishers: Other nodes that publish `/clock`.
-        publishes_clock: Whether this node does.
-        log: `off`, a directory, or the failure.
-        has_log_failed: Whether logging has stopped.
-    """
-
-    commanders: Sequence[str] = ()
-    input_problems: Sequence[str] = ()
-    robots: Sequence[str] = ()
-    waiting_elsewhere: Sequence[str] = ()
-    clock_publishers: Sequence[str] = ()
-    publishes_clock: bool = True
-    log: str = 'off'
-    has_log_failed: bool = False
-
-    @property
-    def command_source(self) -> str:
-        """Which nodes should send commands, as the end of a sentence."""
-        if self.commanders:
-            verb = 'sends' if len(self.commanders) == 1 else 'send'
-            return f'{", ".join(self.commanders)} {verb} none'
-        return '; '.join(['no node publishes any', *self.waiting_elsewhere])
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Situation:
-    """The input of the conditions.
-
-    Attributes:
-        grown: Increase of each counter since the last report.
-        rate: Ticks per second since then.
-        shortfall: Whether that is less than requested, over a whole period of one pace.
-    """
-
-    robot: Robot
-    around: Surroundings
-    grown: Mapping[str, int] = field(default_factory=dict)
-    rate: float = 0.0
-    shortfall: bool = False
-
-    def count(self, name: str) -> int:
-        """Return the increase of a counter."""
-        return self.grown.get(name, 0)
-
-    @property
-    def next_tick(self) -> str:
-        """Name of the next tick."""
-        runner = self.robot.runner
-        if runner.is_between_episodes:
-            return f'the start of episode {runner.episode}'
-        return f'tick {runner.current.tick + 1} of episode {runner.episode}'
-
-    @property
-    def last_rejection(self) -> str:
-        """Why the last command was rejected, as the end of a sentence."""
-        reason = self.robot.buffer.last_rejection
-        return f'; the last command was rejected: {reason}' if reason else ''
-
-    @property
-    def fallback(self) -> str:
-        """The reaction of the robot to missing commands."""
-        buffer = self.robot.buffer
-        return 'repeats the last one' if buffer.has_command and not buffer.timeout else 'holds'
-
-
-@dataclass(frozen=True, slots=True)
-class Condition:
-    """Something wrong with a robot.
-
-    Attributes:
-        applies: The predicate.
-        sentence: Cause and remedy.
-        lasts: Whether it stays until the user acts; such conditions are logged when they begin.
-    """
-
-    name: str
-    level: Level
-    applies: Callable[[Situation], object]
-    sentence: Callable[[Situation], str]
-    lasts: bool = False
-
-
-WAITING = Condition(
-    'waits for a command',
-    Level.WARN,
-    lambda s: s.robot.misses_commands and s.robot.schedule.waits_for_commands,
-    lambda s: (
-        f'{s.next_tick} waits for a valid command; {s.around.command_source}' + s.last_rejection
-    ),
-)
-CONDITIONS = (
-    Condition(
-        'diverged',
-        Level.ERROR,
-        lambda s: s.count('diverged'),
-        lambda s: f'the simulation diverged {s.count("diverged")} times',
-    ),
-    Condition(
-        'ticks missed',
-        Level.WARN,
-        lambda s: s.count('missed'),
-        lambda s: f'{s.count("missed")} ticks missed',
-    ),
-    Condition(
-        'commands late',
-        Level.WARN,
-        lambda s: s.count('late'),
-        lambda s: f'{s.count("late")} late commands: not the answer to the last observation',
-    ),
-    Condition(
-        'too slow',
-        Level.WARN,
-        lambda s: s.shortfall and not s.count('missed'),
-        lambda s: f'{s.rate:.1f} ticks per second instead of {s.robot.schedule.asked_rate:.1f}',
-    ),
-    Condition(
-        'commands rejected',
-        Level.WARN,
-        lambda s: s.count('rejected'),
-        lambda s: f'{s.count("rejected")} commands rejected; {s.robot.buffer.last_rejection}',
-    ),
-    Condition(
-        'commands far out of range',
-        Level.WARN,
-        lambda s: s.count('far out'),
-        lambda s: (
-            f'{s.count("far out")} commands clipped from far out of range; '
-            + s.robot.buffer.last_far_out
-        ),
-    ),
-    Condition(
-        'goals rejected',
-        Level.WARN,
-        lambda s: s.count('goals rejected'),
-        lambda s: (
-            f'{s.count("goals rejected")} goals rejected; ' + s.robot.counters.last_goal_rejection
-        ),
-    ),
-    Condition('log failed', Level.ERROR, lambda s: s.around.has_log_failed, lambda s: s.around.log),
-    Condition(
-        'several robots',
-        Level.ERROR,
-        lambda s: len(s.around.robots) > 1,
-        lambda s: (
-            f'{len(s.around.robots)} nodes publish as one robot: '
-            f'{", ".join(s.around.robots)}; give each its own namespace: '
-            '--ros-args -r __ns:=/robot2'
-        ),
-        lasts=True,
-    ),
-    Condition(
-        'several clocks',
-        Level.ERROR,
-        lambda s: (
-            len(s.around.robots) < 2 and s.around.publishes_clock and s.around.clock_publishers
-        ),
-        lambda s: (
-            f'/clock is also published by {", ".join(s.around.clock_publishers)}; start all '
-            'robots but one with publish_clock:=false'
-        ),
-        lasts=True,
-    ),
-    Condition(
-        'wrong publishers',
-        Level.WARN,
-        lambda s: s.around.input_problems,
-        lambda s: '; '.join(s.around.input_problems),
-        lasts=True,
-    ),
-    Condition(
-        'commands stopped',
-        Level.WARN,
-        lambda s: s.robot.misses_commands and not s.robot.schedule.waits_for_commands,
-        lambda s: f'commands have stopped, the robot {s.fallback}; {s.around.command_source}',
-        lasts=True,
-    ),
-    WAITING,
-)
+Problem = tuple[Level, str]
 
 
 class Health:
-    """Turns a robot's counters into reports; rates are over the time between two of them.
+    """Reports on a robot to `/diagnostics` and to the log of its node.
+
+    Counters and rates are over the time between two reports. Times are seconds of one steady clock.
 
     Args:
+        node: The simulator node, with the parameters `episode_dir` and `publish_clock`.
         robot: The robot.
-        name: Fully qualified name of the node.
-        now: Seconds of a steady clock.
-
-    Attributes:
-        real_time_factor: Simulated seconds per second in the last period.
+        watch: The graph, kept up to date by the node.
+        recorder: Logs the episodes; None if logging is off.
+        now: The time.
     """
 
-    def __init__(self, robot: Robot, name: str, now: float) -> None:
+    def __init__(
+        self,
+        node: Node,
+        robot: Robot,
+        watch: GraphWatch,
+        recorder: EpisodeRecorder | None,
+        now: float,
+    ) -> None:
+        self._node = node
+        self._name = node.get_fully_qualified_name()
         self._robot = robot
-        self._name = name
+        self._watch = watch
+        self._recorder = recorder
+        self._directory = str(node.get_parameter('episode_dir').value)
+        self._publishes_clock = bool(node.get_parameter('publish_clock').value)
         self._then = now
         self._increases: defaultdict[str, Increase] = defaultdict(Increase)
         self._simulated = Increase()
         self._simulated.since(robot.runner.stamp_ns)
         self._pace_before: tuple[float | None, int] = (None, 0)
-        self.real_time_factor = 0.0
+        self._real_time_factor = 0.0
+        self._factor_codec = TopicCodec(REAL_TIME_FACTOR)
+        self._commanders: list[str] = []
+        self._logged: set[str] = set()
+        self._has_logged_far_out = False
 
-    def report(self, around: Surroundings, now: float) -> Report:
-        """Close a period and return its report.
+    @property
+    def has_log_failed(self) -> bool:
+        """True if logging has stopped."""
+        return self._recorder is not None and self._recorder.has_failed
 
-        Args:
-            around: State of the graph and of the log.
-            now: Seconds of the same clock.
-        """
-        seconds, self._then = max(now - self._then, 1e-9), now
-        self.real_time_factor = self._simulated.since(self._robot.runner.stamp_ns) * 1e-9 / seconds
-        situation = self._situation(around, seconds)
-        task = self._robot.runner.spec.name
-        report = Report(
-            self._name,
-            task,
-            self._values(situation),
-            f'{task} {self._state()}, {situation.rate:.1f} ticks per second',
-        )
-        report.problems += [
-            (c.level, c.sentence(situation)) for c in CONDITIONS if c.applies(situation)
-        ]
-        return report
+    def messages(self, now: float) -> Messages:
+        """Close a period: return its messages, and log what is new."""
+        report = self.report(now)
+        self._log_news()
+        factor = self._factor_codec.encode(0, [self._real_time_factor])
+        return [(DIAGNOSTICS, encode_reports(report)), (REAL_TIME_FACTOR, factor)]
 
-    def _situation(self, around: Surroundings, seconds: float) -> Situation:
-        robot = self._robot
+    def log_waiting(self) -> None:
+        """Log the missing command, at most once in `WAITING_PERIOD`."""
+        self._node.get_logger().warning(self._waiting(), **seldom(WAITING_PERIOD))
+
+    def report(self, now: float) -> Report:
+        """Close a period and return its report."""
+        robot, seconds = self._robot, max(now - self._then, 1e-9)
+        self._then = now
+        self._real_time_factor = self._simulated.since(robot.runner.stamp_ns) * 1e-9 / seconds
         counters = {
             'ticks': robot.counters.ticks,
             'diverged': robot.runner.simulation.divergences,
@@ -284,32 +108,101 @@ class Health:
         }
         grown = {name: round(self._increases[name].since(n)) for name, n in counters.items()}
         rate = grown['ticks'] / seconds
-        asked = robot.schedule.asked_rate if robot.runner.has_started else None
-        pace_before, self._pace_before = self._pace_before, (asked, robot.schedule.changes)
-        is_one_pace = asked is not None and self._pace_before == pace_before
-        # In slow motion a period may end just before a tick.
-        shortfall = is_one_pace and rate < (1.0 - _RATE_TOLERANCE) * (asked or 0.0) - 1.0 / seconds
-        return Situation(robot=robot, around=around, grown=grown, rate=rate, shortfall=shortfall)
+        state = 'runs' if robot.runner.has_started else 'waits for its first command'
+        if robot.schedule.is_paused:
+            state = 'is paused'
+        task = robot.runner.spec.name
+        summary = f'{task} {state}, {rate:.1f} ticks per second'
+        report = Report(self._name, task, self._values(rate), summary)
+        report.problems += [*self._passing_problems(grown, seconds), *self._lasting_problems()]
+        if robot.misses_commands and robot.schedule.waits_for_commands:
+            report.warn(self._waiting())
+        return report
 
-    def _state(self) -> str:
-        if self._robot.schedule.is_paused:
-            return 'is paused'
-        return 'runs' if self._robot.runner.has_started else 'waits for its first command'
+    def _passing_problems(self, grown: Mapping[str, int], seconds: float) -> Iterator[Problem]:
+        """Yield the problems of a period, from the increase of each counter."""
+        robot = self._robot
+        schedule, buffer = robot.schedule, robot.buffer
+        asked = schedule.asked_rate if robot.runner.has_started else None
+        pace_before, self._pace_before = self._pace_before, (asked, schedule.changes)
+        if n := grown['diverged']:
+            yield Level.ERROR, f'the simulation diverged {n} times'
+        if n := grown['missed']:
+            yield Level.WARN, f'{n} ticks missed'
+        elif asked is not None and self._pace_before == pace_before:
+            rate = grown['ticks'] / seconds
+            # In slow motion a period may end just before a tick.
+            if rate < (1.0 - _RATE_TOLERANCE) * asked - 1.0 / seconds:
+                yield Level.WARN, f'{rate:.1f} ticks per second instead of {asked:.1f}'
+        if n := grown['late']:
+            yield Level.WARN, f'{n} late commands: not the answer to the last observation'
+        if n := grown['rejected']:
+            yield Level.WARN, f'{n} commands rejected; {buffer.last_rejection}'
+        if n := grown['far out']:
+            line = f'{n} commands clipped from far out of range; {buffer.last_far_out}'
+            yield Level.WARN, line
+        if n := grown['goals rejected']:
+            yield Level.WARN, f'{n} goals rejected; {robot.counters.last_goal_rejection}'
+        if self.has_log_failed:
+            yield Level.ERROR, self._log()
 
-    def _values(self, situation: Situation) -> dict[str, str]:
-        robot, around = self._robot, situation.around
+    def _lasting_problems(self) -> Iterator[Problem]:
+        """Yield the problems that stay until the user acts; the log names them when they begin."""
+        watch, buffer = self._watch, self._robot.buffer
+        if len(watch.robots) > 1:
+            yield (
+                Level.ERROR,
+                f'{len(watch.robots)} nodes publish as one robot: {", ".join(watch.robots)}; '
+                'give each its own namespace: --ros-args -r __ns:=/robot2',
+            )
+        elif self._publishes_clock and watch.clock_publishers:
+            yield (
+                Level.ERROR,
+                f'/clock is also published by {", ".join(watch.clock_publishers)}; start all '
+                'robots but one with publish_clock:=false',
+            )
+        if problems := watch.inputs.problems():
+            yield Level.WARN, '; '.join(problems)
+        if self._robot.misses_commands and not self._robot.schedule.waits_for_commands:
+            repeats = buffer.has_command and not buffer.timeout
+            reaction = 'repeats the last one' if repeats else 'holds'
+            source = self._command_source()
+            yield Level.WARN, f'commands have stopped, the robot {reaction}; {source}'
+
+    def _waiting(self) -> str:
+        """Return which tick waits for a command, and which nodes should send it."""
+        runner, rejection = self._robot.runner, self._robot.buffer.last_rejection
+        tick = f'tick {runner.current.tick + 1} of episode {runner.episode}'
+        if runner.is_between_episodes:
+            tick = f'the start of episode {runner.episode}'
+        last = f'; the last command was rejected: {rejection}' if rejection else ''
+        return f'{tick} waits for a valid command; {self._command_source()}{last}'
+
+    def _command_source(self) -> str:
+        """Return which nodes should send commands, as the end of a sentence."""
+        if names := self._watch.inputs.commanders:
+            return f'{", ".join(names)} {"sends" if len(names) == 1 else "send"} none'
+        return '; '.join(['no node publishes any', *self._watch.waiting_elsewhere()])
+
+    def _log(self) -> str:
+        if self.has_log_failed:
+            return f'logging to {self._directory} has failed'
+        return self._directory or 'off'
+
+    def _values(self, rate: float) -> dict[str, str]:
+        robot, watch = self._robot, self._watch
         counters, buffer, schedule = robot.counters, robot.buffer, robot.schedule
-        age, clocks = buffer.age(), list(around.clock_publishers)
-        if around.publishes_clock:
+        age, clocks = buffer.age(), list(watch.clock_publishers)
+        if self._publishes_clock:
             clocks.append(self._name)
         tick_time = counters.tick_time.milliseconds()
         return {
             MODE: schedule.mode,
             PAUSED: str(schedule.is_paused),
             'simulated time (s)': f'{robot.runner.stamp_ns * 1e-9:.3f}',
-            RATE: f'{situation.rate:.2f}',
+            RATE: f'{rate:.2f}',
             ASKED_RATE: f'{schedule.asked_rate:.2f}' if schedule.asked_rate else '-',
-            'real time factor': f'{self.real_time_factor:.3f}',
+            'real time factor': f'{self._real_time_factor:.3f}',
             'ticks': str(counters.ticks),
             MISSED_TICKS: str(schedule.missed_ticks),
             **{f'tick time {name} (ms)': value for name, value in tick_time.items()},
@@ -329,86 +222,22 @@ class Health:
             'episodes given up': str(counters.given_up),
             PERTURB_LIMIT: f'{robot.perturb_limit:g}',
             'divergences': str(robot.runner.simulation.divergences),
-            'log': around.log,
-            COMMANDERS: ', '.join(around.commanders) or '-',
+            'log': self._log(),
+            COMMANDERS: ', '.join(watch.inputs.commanders) or '-',
             'clock publishers': ', '.join(sorted(clocks)) or '-',
         }
 
-
-class Reporter:
-    """Reports on a robot to `/diagnostics` and to the log of its node.
-
-    Args:
-        node: The simulator node.
-        robot: The robot.
-        watch: The graph, kept up to date by the node.
-        directory: Directory of the episode logs; empty for none.
-        has_log_failed: Returns whether logging has stopped.
-    """
-
-    def __init__(
-        self,
-        node: Node,
-        robot: Robot,
-        watch: GraphWatch,
-        directory: str,
-        has_log_failed: Callable[[], bool],
-    ) -> None:
-        self._node = node
-        self._robot = robot
-        self._watch = watch
-        self._directory = directory
-        self._has_log_failed = has_log_failed
-        self._publishes_clock = bool(node.get_parameter('publish_clock').value)
-        self._health = Health(robot, node.get_fully_qualified_name(), time.monotonic())
-        self._factor_codec = TopicCodec(REAL_TIME_FACTOR)
-        self._commanders: Sequence[str] = ()
-        self._logged: set[str] = set()
-        self._has_logged_far_out = False
-
-    def report(self, now: float) -> Messages:
-        """Close a period: return its messages and log what is new.
-
-        Args:
-            now: Seconds of `time.monotonic`.
-        """
-        around = self._surroundings()
-        report = self._health.report(around, now)
-        self._log_news(around)
-        factor = self._factor_codec.encode(0, [self._health.real_time_factor])
-        return [(DIAGNOSTICS, encode_reports(report)), (REAL_TIME_FACTOR, factor)]
-
-    def log_waiting(self) -> None:
-        """Log the missing command, at most once in `WAITING_PERIOD`."""
-        situation = Situation(robot=self._robot, around=self._surroundings())
-        self._node.get_logger().warning(WAITING.sentence(situation), **seldom(WAITING_PERIOD))
-
-    def _surroundings(self) -> Surroundings:
-        watch, has_failed = self._watch, self._has_log_failed()
-        commanders = watch.inputs.commanders
-        log = f'logging to {self._directory} has failed' if has_failed else self._directory
-        return Surroundings(
-            commanders=commanders,
-            input_problems=watch.inputs.problems(),
-            robots=watch.robots,
-            waiting_elsewhere=[] if commanders else watch.waiting_elsewhere(),
-            clock_publishers=watch.clock_publishers,
-            publishes_clock=self._publishes_clock,
-            log=log or 'off',
-            has_log_failed=has_failed,
-        )
-
-    def _log_news(self, around: Surroundings) -> None:
-        """Log changes of the commanders, and each lasting condition once when it begins."""
+    def _log_news(self) -> None:
+        """Log changes of the commanders, and each lasting problem once when it begins."""
         logger, buffer = self._node.get_logger(), self._robot.buffer
-        if list(around.commanders) != list(self._commanders):
-            self._commanders = around.commanders
-            logger.info(f'commands come from {", ".join(around.commanders) or "no node any more"}')
+        commanders = self._watch.inputs.commanders
+        if commanders != self._commanders:
+            self._commanders = commanders
+            logger.info(f'commands come from {", ".join(commanders) or "no node any more"}')
         if buffer.far_out and not self._has_logged_far_out:
             self._has_logged_far_out = True
             logger.warning(f'command clipped from far out of range: {buffer.last_far_out}')
-        situation = Situation(robot=self._robot, around=around)
-        lines = {c.sentence(situation) for c in CONDITIONS if c.lasts and c.applies(situation)}
+        lines = {line for _, line in self._lasting_problems()}
         for line in sorted(lines - self._logged):
             logger.warning(line)
         self._logged = lines

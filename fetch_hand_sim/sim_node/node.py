@@ -22,7 +22,7 @@ from fetch_hand_sim.episodes.recorder import EpisodeRecorder, LoggedEpisode, Rec
 from fetch_hand_sim.episodes.runner import EpisodeRunner
 from fetch_hand_sim.sim_node import NODE_NAME
 from fetch_hand_sim.sim_node.graph_watch import GraphWatch
-from fetch_hand_sim.sim_node.health import WAITING_PERIOD, Reporter
+from fetch_hand_sim.sim_node.health import WAITING_PERIOD, Health
 from fetch_hand_sim.sim_node.robot import Messages, Receivers, Robot
 from fetch_hand_sim.sim_node.schedule import LatestTick, TickSchedule
 from fetch_hand_sim.sim_node.services import open_services
@@ -31,15 +31,11 @@ from msgs_spec.disturbances import read_disturbances
 from msgs_spec.parameters import SIM_NODE
 from msgs_spec.robots import read_joint_prefix
 from msgs_spec.tick import EpisodeStatus, Tick, TickEncoder
-from msgs_spec.topics import LATEST_TICK, MONITORING, TopicSpec, ground_truth_topics, topics
+from msgs_spec.topics import LATEST_TICK, MONITORING, ground_truth_topics, topics
 from node_runtime.diagnostics import REPORT_PERIOD, next_report
 from node_runtime.event_loop import BEAT, EventLoop
 from node_runtime.node_main import NodeFailure, StopSignals
-from node_runtime.ros import (
-    await_acknowledgements,
-    rclpy_profile,
-    ros_message_class,
-)
+from node_runtime.ros import await_acknowledgements, open_publisher, subscribe
 from node_runtime.ros_parameters import declare_parameters, set_callback
 
 _WARN_PERIOD = 1.0
@@ -72,13 +68,7 @@ class SimNode(Node):
         self._watch = GraphWatch(self, self._robot.runner.spec, self._outputs)
         open_services(self, self._robot)
         now = time.monotonic()
-        self._reporter = Reporter(
-            self,
-            self._robot,
-            self._watch,
-            self._settings['episode_dir'],
-            lambda: self._has_log_failed,
-        )
+        self._health = Health(self, self._robot, self._watch, self._recorder, now)
         self._has_policy_status = False
         self._beat_due = self._ticked_at = now
         self._report_due = now + REPORT_PERIOD
@@ -134,16 +124,10 @@ class SimNode(Node):
         # `latest_tick` comes before the topics of the task, so that viewers never miss it.
         for spec in (*MONITORING, *topics(self._robot.runner.spec)):
             if spec.direction == 'subscribed':
-                message_class, profile = ros_message_class(spec.type_name), rclpy_profile(spec.qos)
-                callback = receivers.callback(spec)
-                self.create_subscription(message_class, spec.name, callback, profile, raw=True)
+                subscribe(self, spec, receivers.callback(spec), raw=True)
             elif spec.name != '/clock' or self._settings['publish_clock']:
-                publishers[spec.name] = self._publisher(spec)
+                publishers[spec.name] = open_publisher(self, spec)
         return publishers
-
-    def _publisher(self, spec: TopicSpec) -> Publisher:
-        message_class, profile = ros_message_class(spec.type_name), rclpy_profile(spec.qos)
-        return self.create_publisher(message_class, spec.name, profile)
 
     def _open_ground_truth(self) -> None:
         """Publish the true state too, once something disturbs the robot."""
@@ -151,7 +135,7 @@ class SimNode(Node):
             return
         for spec in ground_truth_topics(self._robot.runner.spec):
             if spec.name not in self._outputs:
-                self._outputs[spec.name] = self._publisher(spec)
+                self._outputs[spec.name] = open_publisher(self, spec)
 
     def _make_recorder(self) -> EpisodeRecorder | None:
         directory = self._settings['episode_dir']
@@ -205,12 +189,8 @@ class SimNode(Node):
         finally:
             self._close(stop)
             loop.close()
-        if self._robot.runner.is_done and self._has_log_failed:
+        if self._robot.runner.is_done and self._health.has_log_failed:
             raise NodeFailure(f'not all episodes are in {self._settings["episode_dir"]}')
-
-    @property
-    def _has_log_failed(self) -> bool:
-        return self._recorder is not None and self._recorder.has_failed
 
     def _description(self) -> str:
         """Return a line about the task, the pace, the topics and the log."""
@@ -273,7 +253,7 @@ class SimNode(Node):
             self._report_due = next_report(self._report_due, now)
             self._watch.update()
             self._clear_departed_policy()
-            self._publish(self._reporter.report(now))
+            self._publish(self._health.messages(now))
 
     def _stand_still(self, now: float) -> None:
         """Publish `/clock` while idle and repeat the last tick for new subscribers."""
@@ -291,7 +271,7 @@ class SimNode(Node):
         elif not has_started:
             is_waiting = now - self._ticked_at > WAITING_PERIOD
         if is_waiting:
-            self._reporter.log_waiting()
+            self._health.log_waiting()
 
     def _emit(self, tick: Tick, messages: Messages) -> None:
         if self._watch.has_newcomer and self._watch.are_subscribers_connected():

@@ -7,9 +7,10 @@ import re
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol
+from typing import Any
 
 from fetch_hand_sim.episodes.command_buffer import CommandBuffer
+from fetch_hand_sim.episodes.recorder import EpisodeRecorder
 from fetch_hand_sim.episodes.runner import EpisodeRunner, accept_goal, accept_perturbation
 from fetch_hand_sim.sim_node.schedule import TickSchedule
 from msgs_spec.codecs import answered_stamp, decode_status
@@ -260,13 +261,6 @@ class Robot:
 # Received messages
 
 
-class ReceivedLog(Protocol):
-    """The recorder's method for received messages."""
-
-    def record_received(self, topic: TopicSpec, data: bytes, *, is_refused: bool) -> None:
-        """Record the CDR bytes of one message, and whether the robot rejected it."""
-
-
 class Receivers:
     """Pass received messages to a robot; rejected ones are counted and reported, never raised.
 
@@ -277,7 +271,7 @@ class Receivers:
     def __init__(
         self,
         robot: Robot,
-        log: ReceivedLog | None,
+        log: EpisodeRecorder | None,
         on_commander: Callable[[str | None], None],
         warn: Callable[[str, str], None],
     ) -> None:

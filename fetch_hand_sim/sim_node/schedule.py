@@ -5,10 +5,13 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Sequence
-from typing import Literal, Protocol
+from typing import TYPE_CHECKING, Literal
 
 from msgs_spec.tick import Tick, TickEncoder, join_messages
 from msgs_spec.topics import LATEST_TICKS_PER_SECOND, TopicSpec
+
+if TYPE_CHECKING:
+    from rclpy.publisher import Publisher
 
 Mode = Literal['realtime', 'lockstep']
 Messages = Sequence[tuple[TopicSpec, bytes]]
@@ -108,21 +111,11 @@ class TickSchedule:
         self._due = max(now, self._began + self.period)
 
 
-class Output(Protocol):
-    """The methods of rclpy's publisher that are needed here."""
-
-    def publish(self, msg: bytes) -> None:
-        """Send a message."""
-
-    def get_subscription_count(self) -> int:
-        """Return the number of subscribers."""
-
-
 class LatestTick:
     """Publishes the newest tick while the topic has subscribers."""
 
     def __init__(
-        self, output: Output, encoder: TickEncoder, clock: Callable[[], float] = time.monotonic
+        self, output: Publisher, encoder: TickEncoder, clock: Callable[[], float] = time.monotonic
     ) -> None:
         self._output = output
         self._encoder = encoder

@@ -38,7 +38,7 @@ from node_runtime.diagnostics import (
     PERTURB_LIMIT,
     RATE,
 )
-from node_runtime.ros import full_name
+from node_runtime.ros import full_name, subscribe
 
 # A robot counts as fast above its real-time rate times this factor.
 _HURRY = 1.5
@@ -75,9 +75,8 @@ class LiveRobot:
         self._unread: set[str] = set()
         self._requests = RobotRequests(node, self._update_facts)
         self._watch = RobotWatch(node, self._on_status, self._on_tick, every_tick=False)
-        self._watch.subscribe(DIAGNOSTICS, WATCHING, self._on_diagnostics)
-        introduction = topic(ANY_TASK, 'policy_status')
-        self._watch.subscribe(introduction, introduction.qos, self._on_policy)
+        subscribe(node, DIAGNOSTICS, self._on_diagnostics, qos=WATCHING)
+        subscribe(node, topic(ANY_TASK, 'policy_status'), self._on_policy)
         self._replays = ReplayWatch(node)
         # Steady time, because simulated time stops with a paused robot.
         clock = Clock(clock_type=ClockType.STEADY_TIME)

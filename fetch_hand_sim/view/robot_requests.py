@@ -31,7 +31,7 @@ from msgs_spec.codecs import TopicCodec, build_message
 from msgs_spec.schemas import serialize
 from msgs_spec.tasks import TaskSpec
 from msgs_spec.topics import PAUSE, topic
-from node_runtime.ros import rclpy_profile, ros_message_class, ros_service_class
+from node_runtime.ros import open_publisher, ros_service_class
 
 _SET_PARAMETERS = 'rcl_interfaces/srv/SetParameters'
 _GET_PARAMETERS = 'rcl_interfaces/srv/GetParameters'
@@ -317,9 +317,7 @@ class RobotRequests:
         assert self._spec is not None
         target = topic(self._spec, name)
         if name not in self._publishers:
-            self._publishers[name] = self._node.create_publisher(
-                ros_message_class(target.type_name), target.name, rclpy_profile(target.qos)
-            )
+            self._publishers[name] = open_publisher(self._node, target)
         self._publishers[name].publish(data)
 
     def _withdraw(self, name: str) -> None:

@@ -21,8 +21,8 @@ from msgs_spec.robots import JOINT_PREFIX
 from msgs_spec.schemas import deserialize
 from msgs_spec.tasks import TASKS, TaskSpec, task_spec
 from msgs_spec.tick import EpisodeStatus, split_messages
-from msgs_spec.topics import LATEST_TICK, PAUSE, RESET, QosSpec, TopicSpec, topic
-from node_runtime.ros import count_publishers, full_name, rclpy_profile, ros_message_class
+from msgs_spec.topics import LATEST_TICK, PAUSE, RESET, QosSpec, topic
+from node_runtime.ros import count_publishers, full_name, subscribe
 
 # QoS of a viewer.
 WATCHING = QosSpec(depth=5, reliability='best_effort', durability='volatile')
@@ -98,7 +98,7 @@ class RobotWatch:
         self._subscriptions: list[Any] = []
         self._change: Any = None
         self._status_topic = status = topic(ANY_TASK, 'episode_status')
-        self.subscribe(status, status.qos, self._on_status_message)
+        subscribe(node, status, self._on_status_message)
         # Steady time, because simulated time stops with the robot.
         self._clock = Clock(clock_type=ClockType.STEADY_TIME)
         if not every_tick:
@@ -113,16 +113,6 @@ class RobotWatch:
     def joint_prefix(self) -> str:
         """The prefix of the robot's joint names."""
         return self.status.joint_prefix if self.status else JOINT_PREFIX
-
-    def subscribe(
-        self, source: TopicSpec, qos: QosSpec, callback: Callable[[Any], None], raw: bool = False
-    ) -> Any:
-        """Subscribe to a topic and return the subscription of rclpy."""
-        message_class = ros_message_class(source.type_name)
-        profile = rclpy_profile(qos)
-        return self._node.create_subscription(
-            message_class, source.name, callback, profile, raw=raw
-        )
 
     def _on_status_message(self, message: Any) -> None:
         """Take a status from its own topic, unless `latest_tick` brings it."""
@@ -192,14 +182,12 @@ class RobotWatch:
         names = [*_STATE, *(['object_pose'] if spec.has_object else [])]
         self._codecs = {name: TopicCodec(topic(spec, name)) for name in names}
         self._takes_latest = self._has_latest()
-        if self._takes_latest:
-            self._subscriptions = [
-                self.subscribe(LATEST_TICK, WATCHING, self._take_latest, raw=True)
-            ]
-            return
+        collectors = {each.topic: self._collector(each) for each in self._codecs.values()}
+        callbacks = {LATEST_TICK: self._take_latest} if self._takes_latest else collectors
+        qos = WATCHING if self._takes_latest else _FOLLOWING
         self._subscriptions = [
-            self.subscribe(each.topic, _FOLLOWING, self._collector(each), raw=True)
-            for each in self._codecs.values()
+            subscribe(self._node, source, callback, qos=qos, raw=True)
+            for source, callback in callbacks.items()
         ]
 
     def _collector(self, codec: TopicCodec) -> Callable[[bytes], None]:

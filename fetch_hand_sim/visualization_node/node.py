@@ -37,8 +37,7 @@ from node_runtime.node_main import NodeFailure, StopSignals
 from node_runtime.ros import (
     SubscriberWatch,
     count_publishers,
-    rclpy_profile,
-    ros_message_class,
+    open_publisher,
     seldom,
 )
 from node_runtime.ros_parameters import declare_parameters
@@ -74,11 +73,7 @@ class VisualizationNode(Node):
         self._outputs: dict[str, Any] = {}
         for source in SHOWN:
             self._open(source)
-        self._diagnostics = self.create_publisher(
-            ros_message_class(DIAGNOSTICS.type_name),
-            DIAGNOSTICS.name,
-            rclpy_profile(DIAGNOSTICS.qos),
-        )
+        self._diagnostics = open_publisher(self, DIAGNOSTICS)
         self._listeners = SubscriberWatch(self, self._outputs.values())
         self._has_newcomer = False
         self._report_due = time.monotonic() + REPORT_PERIOD
@@ -110,16 +105,12 @@ class VisualizationNode(Node):
     def _open(self, source: TopicSpec) -> None:
         """Open a topic unless its message type is missing; PyPI lacks tf2_msgs."""
         try:
-            message_class = ros_message_class(source.type_name)
+            self._outputs[source.name] = open_publisher(self, source)
         except ImportError:
             package = source.type_name.partition('/')[0]
             self.get_logger().warning(
                 f'{package} is not installed: no {source.name}; a sourced ROS has it'
             )
-            return
-        self._outputs[source.name] = self.create_publisher(
-            message_class, source.name, rclpy_profile(source.qos)
-        )
 
     def _has_listener(self, name: str) -> bool:
         return bool(self._outputs[name].get_subscription_count())

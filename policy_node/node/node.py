@@ -18,12 +18,12 @@ from msgs_spec.parameters import POLICY_NODE
 from msgs_spec.schemas import deserialize, require_short, serialize
 from msgs_spec.tasks import TASKS, task_spec
 from msgs_spec.tick import EpisodeStatus
-from msgs_spec.topics import DIAGNOSTICS, STATE, QosSpec, TopicSpec, topic
+from msgs_spec.topics import DIAGNOSTICS, STATE, TopicSpec, topic
 from node_runtime.command_line import UsageError
 from node_runtime.diagnostics import REPORT_PERIOD, encode_reports, next_report
 from node_runtime.event_loop import BEAT, EventLoop
 from node_runtime.node_main import NodeFailure, StopSignals
-from node_runtime.ros import rclpy_profile, ros_message_class, seldom
+from node_runtime.ros import open_publisher, seldom, subscribe
 from node_runtime.ros_parameters import declare_parameters, set_callback
 from policy_node.node import NODE_NAME
 from policy_node.node.health import Health, Pace, read_pace
@@ -67,13 +67,13 @@ class PolicyNode(Node):
         self._pace_until = -math.inf
         self._is_replaced = False
         self._health = Health(self.get_fully_qualified_name())
-        self._diagnostics = self._publisher(DIAGNOSTICS)
+        self._diagnostics = open_publisher(self, DIAGNOSTICS)
         self._report_due = time.monotonic() + REPORT_PERIOD
         self._elsewhere_from = time.monotonic() + _PATIENCE
         self._status_name = self.resolve_topic_name('episode_status')
         status = topic(_ANY_TASK, 'episode_status')
-        self._subscribe(status, self._reader(status, self._on_status))
-        self._subscribe(DIAGNOSTICS, self._reader(DIAGNOSTICS, self._on_diagnostics))
+        subscribe(self, status, self._reader(status, self._on_status), raw=True)
+        subscribe(self, DIAGNOSTICS, self._reader(DIAGNOSTICS, self._on_diagnostics), raw=True)
         self.add_on_set_parameters_callback(self._take_policy)
 
     def run(self, stop: StopSignals) -> None:
@@ -130,7 +130,7 @@ class PolicyNode(Node):
             raise NodeFailure(str(error)) from None
         self._responder, self._answered_status = responder, status
         state = [
-            self._subscribe(source, self._receiver(responder, source.name), STATE)
+            subscribe(self, source, self._receiver(responder, source.name), qos=STATE, raw=True)
             for source in responder.topics
         ]
         self._of_robot += state
@@ -142,7 +142,7 @@ class PolicyNode(Node):
             self._report_when_due(missing if time.monotonic() > began + _PATIENCE else ())
         self._announce(policy)
         # Created last: for the robot, this publisher means that the policy is ready.
-        self._commands = self._publisher(topic(task_spec(policy.task), 'commands'))
+        self._commands = open_publisher(self, topic(task_spec(policy.task), 'commands'))
         self._of_robot.append(self._commands)
         self._health.start(responder, status, time.monotonic())
         self.get_logger().info(f'{policy.task}: commands come from {policy.description}')
@@ -233,28 +233,9 @@ class PolicyNode(Node):
         status = topic(task_spec(policy.task), 'policy_status')
         values = {'commander': policy.description, 'checkpoint_sha256': policy.sha256}
         message = build_status(status, self._status_stamp, NODE_NAME, values)
-        publisher = self._publisher(status)
+        publisher = open_publisher(self, status)
         self._of_robot.append(publisher)
         publisher.publish(serialize(status.type_name, message))
-
-    def _subscribe(
-        self,
-        spec: TopicSpec,
-        callback: Callable[[bytes], None],
-        qos: QosSpec | None = None,
-    ) -> Subscription:
-        return self.create_subscription(
-            ros_message_class(spec.type_name),
-            spec.name,
-            callback,
-            rclpy_profile(qos or spec.qos),
-            raw=True,
-        )
-
-    def _publisher(self, spec: TopicSpec) -> Publisher:
-        return self.create_publisher(
-            ros_message_class(spec.type_name), spec.name, rclpy_profile(spec.qos)
-        )
 
     def _reader(self, spec: TopicSpec, callback: Callable[[Any], None]) -> Callable[[bytes], None]:
         """Return a callback that passes readable messages on and reports others."""

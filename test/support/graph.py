@@ -22,7 +22,7 @@ from msgs_spec.codecs import decode_status, message_stamp
 from msgs_spec.tasks import TaskSpec
 from msgs_spec.tick import EpisodeStatus
 from msgs_spec.topics import MONITORING, TopicSpec, topic, topics
-from node_runtime.ros import rclpy_profile, ros_message_class
+from node_runtime.ros import open_publisher, subscribe
 
 SIM_NODE = (sys.executable, '-m', 'fetch_hand_sim.sim_node')
 POLICY_NODE = (sys.executable, '-m', 'policy_node.node')
@@ -84,22 +84,15 @@ class Client:
         """Subscribes to topics, or to all; keeps `depth` messages until served."""
         for name in names or [s.name for s in topics(self.spec) if s.direction == 'published']:
             source = self._topic(name)
-            self.node.create_subscription(
-                ros_message_class(source.type_name),
-                name,
-                self._collector(name),
-                rclpy_profile(replace(source.qos, depth=depth or source.qos.depth)),
-            )
+            qos = replace(source.qos, depth=depth or source.qos.depth)
+            subscribe(self.node, source, self._collector(name), qos=qos)
 
     def publish(self, name: str, message: Any) -> None:
         self.publisher(name).publish(message)
 
     def publisher(self, name: str) -> Any:
         if name not in self._publishers:
-            target = topic(self.spec, name)
-            self._publishers[name] = self.node.create_publisher(
-                ros_message_class(target.type_name), name, rclpy_profile(target.qos)
-            )
+            self._publishers[name] = open_publisher(self.node, topic(self.spec, name))
         return self._publishers[name]
 
     def connect(self, name: str) -> None:

@@ -10,7 +10,10 @@ def endpoint(node, name='/commands', type_name='T', reliable=True, gid=None):
 
 
 def test_new_and_competing_commanders_are_reported():
-    watch = InputWatch({'/commands': 'T', '/joint_commands': 'J'}, {'/set_goal': 'G'})
+    watch = InputWatch(
+        {'/commands': 'T', '/joint_commands': 'J', '/set_goal': 'G'},
+        ['/commands', '/joint_commands'],
+    )
     assert not watch.update([endpoint('/goals', '/set_goal', 'G')], 0.0)
     a, b = endpoint('/a'), endpoint('/a', '/joint_commands', 'J')
     assert watch.update([a, b], 1.0)
@@ -24,7 +27,7 @@ def test_new_and_competing_commanders_are_reported():
 
 def test_a_restarted_commander_is_one_and_two_of_a_name_are_two():
     """The graph shows a killed process for 20 s."""
-    watch = InputWatch({'/commands': 'T'}, {})
+    watch = InputWatch({'/commands': 'T'}, ['/commands'])
     killed, successor = endpoint('/a'), endpoint('/a', gid=b'other')
     watch.update([killed], 0.0)
     assert watch.update([killed, successor], 10.0)
@@ -37,7 +40,7 @@ def test_a_restarted_commander_is_one_and_two_of_a_name_are_two():
 
 
 def test_publishers_that_the_robot_cannot_receive_are_reported_with_the_reason():
-    watch = InputWatch({'/commands': 'T'}, {'/set_goal': 'G'})
+    watch = InputWatch({'/commands': 'T', '/set_goal': 'G'}, ['/commands'])
     others = [endpoint('/c', '/set_goal', 'P')]
     watch.update([endpoint('/a', reliable=False), endpoint('/b', type_name='S'), *others], 0.0)
     assert watch.commanders == []
