@@ -12,66 +12,83 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any
 
 from msgs_spec.text import did_you_mean, entries, one_line
 
 Span = tuple[float, float]
-Kind = Literal['size', 'probability', 'factor', 'ticks', 'period', 'span']
 
 # The longest delay, in ticks.
 MOST_TICKS = 4
 # Bytes of a file of disturbances.
 _LONGEST_FILE = 100_000
-_LIMITS: dict[Kind, Span] = {
-    'size': (0.0, 100.0),
-    'probability': (0.0, 1.0),
-    'factor': (0.05, 20.0),
-    'ticks': (0, MOST_TICKS),
-    'period': (1, 100),
-    'span': (-1.0, 1.0),
-}
-_OFF: dict[Kind, Any] = {
-    'size': 0.0,
-    'probability': 0.0,
-    'factor': (1.0, 1.0),
-    'ticks': (0, 0),
-    'period': (1, 1),
-    'span': (0.0, 0.0),
-}
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """Limits and meaning of a field.
+
+    Attributes:
+        off: The number that disturbs nothing.
+        is_range: Whether a value is a pair (lowest, highest) from which each episode draws; one
+            number n stands for (n, n).
+    """
+
+    off: float
+    lowest: float
+    highest: float
+    is_range: bool = True
+    is_whole: bool = False
+
+    def checked(self, name: str, value: Any) -> Any:
+        """Return a value in its form, or raise ValueError with the allowed range."""
+        given = list(value) if self.is_range and isinstance(value, (list, tuple)) else [value]
+        is_right = len(given) in (1, 1 + self.is_range) and all(
+            isinstance(each, (int, float))
+            and not isinstance(each, bool)
+            and self.lowest <= each <= self.highest
+            and not (self.is_whole and each != int(each))
+            for each in given
+        )
+        if not is_right or given[0] > given[-1]:
+            raise ValueError(
+                f'{name}={one_line(value, 40)}; allowed: a {"whole " if self.is_whole else ""}'
+                f'number {self.lowest:g} ... {self.highest:g}'
+                f'{", or [lowest, highest]" if self.is_range else ""}'
+            )
+        numbers = [int(each) if self.is_whole else float(each) for each in given]
+        return (numbers[0], numbers[-1]) if self.is_range else numbers[0]
+
+    def scaled(self, value: Any, strength: float) -> Any:
+        """Return a value `strength` times as far from `off`, within the limits."""
+        if isinstance(value, tuple):
+            return tuple(self.scaled(each, strength) for each in value)
+        change = strength * (value - self.off)
+        moved = self.off + (round(change) if self.is_whole else change)
+        return min(max(value**strength if self is FACTOR else moved, self.lowest), self.highest)
+
+    def drawn(self, span: Span, share: float) -> float:
+        """Return the number of a range that is `share` of the way through it."""
+        lowest, highest = span
+        if self.is_whole:
+            return float(lowest + int(share * (highest - lowest + 1)))
+        if self is FACTOR:
+            return float(lowest * (highest / lowest) ** share)
+        return float(lowest + share * (highest - lowest))
+
+
+SIZE = Kind(0.0, 0.0, 100.0, is_range=False)
+PROBABILITY = Kind(0.0, 0.0, 1.0, is_range=False)
+FACTOR = Kind(1.0, 0.05, 20.0)
+TICKS = Kind(0, 0, MOST_TICKS, is_whole=True)
+PERIOD = Kind(1, 1, 100, is_whole=True)
+SHIFT = Kind(0.0, -1.0, 1.0)
 
 
 def _off(kind: Kind) -> Any:
-    """A field that is off by default.
-
-    `size` and `probability` are one number. The other kinds are a range (lowest, highest) from
-    which each episode draws; one number n stands for (n, n).
-    """
-    return field(default=_OFF[kind], metadata={'kind': kind})
-
-
-def _checked(name: str, value: Any, kind: Kind) -> Any:
-    """Return a value in its form, or raise a `ValueError` with the allowed range."""
-    lowest, highest = _LIMITS[kind]
-    is_range = isinstance(_OFF[kind], tuple)
-    numbers = list(value) if is_range and isinstance(value, (list, tuple)) else [value]
-    is_right = len(numbers) in ((1, 2) if is_range else (1,)) and all(
-        isinstance(each, (int, float))
-        and not isinstance(each, bool)
-        and lowest <= each <= highest
-        and (kind not in ('ticks', 'period') or each == int(each))
-        for each in numbers
-    )
-    if not is_right or numbers[0] > numbers[-1]:
-        whole = 'whole ' if kind in ('ticks', 'period') else ''
-        form = ', or [lowest, highest]' if is_range else ''
-        raise ValueError(
-            f'{name}={one_line(value, 40)}; allowed: a {whole}number {lowest:g} ... {highest:g}'
-            f'{form}'
-        )
-    if kind in ('ticks', 'period'):
-        return int(numbers[0]), int(numbers[-1])
-    return (float(numbers[0]), float(numbers[-1])) if is_range else float(numbers[0])
+    """Return a field that is off by default."""
+    default = (kind.off, kind.off) if kind.is_range else kind.off
+    return field(default=default, metadata={'kind': kind})
 
 
 @dataclass(frozen=True)
@@ -80,8 +97,7 @@ class _Group:
 
     def __post_init__(self) -> None:
         for each in fields(self):
-            kind = each.metadata['kind']
-            value = _checked(each.name, getattr(self, each.name), kind)
+            value = each.metadata['kind'].checked(each.name, getattr(self, each.name))
             object.__setattr__(self, each.name, value)
 
 
@@ -98,11 +114,11 @@ class ActionDisturbance(_Group):
         bias: Standard deviation of an offset that lasts an episode, likewise.
     """
 
-    latency: Span = _off('ticks')
-    repeat: float = _off('probability')
-    drop: float = _off('probability')
-    noise: float = _off('size')
-    bias: float = _off('size')
+    latency: Span = _off(TICKS)
+    repeat: float = _off(PROBABILITY)
+    drop: float = _off(PROBABILITY)
+    noise: float = _off(SIZE)
+    bias: float = _off(SIZE)
 
 
 @dataclass(frozen=True)
@@ -117,11 +133,11 @@ class JointDisturbance(_Group):
         resolution: Step of the encoders, rad.
     """
 
-    latency: Span = _off('ticks')
-    noise: float = _off('size')
-    bias: float = _off('size')
-    velocity_noise: float = _off('size')
-    resolution: float = _off('size')
+    latency: Span = _off(TICKS)
+    noise: float = _off(SIZE)
+    bias: float = _off(SIZE)
+    velocity_noise: float = _off(SIZE)
+    resolution: float = _off(SIZE)
 
 
 @dataclass(frozen=True)
@@ -139,14 +155,14 @@ class ObjectDisturbance(_Group):
         lost: Probability per tick that tracking is lost for half a second.
     """
 
-    latency: Span = _off('ticks')
-    noise: float = _off('size')
-    bias: float = _off('size')
-    rotation_noise: float = _off('size')
-    rotation_bias: float = _off('size')
-    period: Span = _off('period')
-    stale: float = _off('probability')
-    lost: float = _off('probability')
+    latency: Span = _off(TICKS)
+    noise: float = _off(SIZE)
+    bias: float = _off(SIZE)
+    rotation_noise: float = _off(SIZE)
+    rotation_bias: float = _off(SIZE)
+    period: Span = _off(PERIOD)
+    stale: float = _off(PROBABILITY)
+    lost: float = _off(PROBABILITY)
 
 
 @dataclass(frozen=True)
@@ -164,14 +180,14 @@ class PhysicsDisturbance(_Group):
         table_height: Shift of the table and of what stands on it, m (Fetch).
     """
 
-    friction: Span = _off('factor')
-    object_mass: Span = _off('factor')
-    object_size: Span = _off('factor')
-    gain: Span = _off('factor')
-    force_limit: Span = _off('factor')
-    damping: Span = _off('factor')
-    gravity_tilt: float = _off('size')
-    table_height: Span = _off('span')
+    friction: Span = _off(FACTOR)
+    object_mass: Span = _off(FACTOR)
+    object_size: Span = _off(FACTOR)
+    gain: Span = _off(FACTOR)
+    force_limit: Span = _off(FACTOR)
+    damping: Span = _off(FACTOR)
+    gravity_tilt: float = _off(SIZE)
+    table_height: Span = _off(SHIFT)
 
 
 @dataclass(frozen=True)
@@ -183,8 +199,8 @@ class PushDisturbance(_Group):
         rate: Mean number of pushes per simulated second.
     """
 
-    force: float = _off('size')
-    rate: float = _off('size')
+    force: float = _off(SIZE)
+    rate: float = _off(SIZE)
 
 
 @dataclass(frozen=True)
@@ -196,8 +212,8 @@ class StartDisturbance(_Group):
         joints: Standard deviation of an offset of each joint, rad (hand).
     """
 
-    object_position: float = _off('size')
-    joints: float = _off('size')
+    object_position: float = _off(SIZE)
+    joints: float = _off(SIZE)
 
 
 @dataclass(frozen=True)
@@ -222,7 +238,14 @@ class Disturbances:
         Sizes, probabilities and delays are multiplied, delays are rounded; factors are raised to
         the power of `factor`, so that 0.5 scaled by 2 is 0.25.
         """
-        groups = {each.name: _scaled(getattr(self, each.name), factor) for each in fields(self)}
+        groups = {}
+        for group in fields(self):
+            values = getattr(self, group.name)
+            changes = {
+                each.name: each.metadata['kind'].scaled(getattr(values, each.name), factor)
+                for each in fields(values)
+            }
+            groups[group.name] = dataclasses.replace(values, **changes)
         return dataclasses.replace(self, **groups)
 
     def as_dict(self) -> dict[str, dict[str, Any]]:
@@ -231,7 +254,7 @@ class Disturbances:
         for group in fields(self):
             for each in fields(getattr(self, group.name)):
                 value = getattr(getattr(self, group.name), each.name)
-                if value != _OFF[each.metadata['kind']]:
+                if value != each.default:
                     plain = list(value) if isinstance(value, tuple) else value
                     found.setdefault(group.name, {})[each.name] = plain
         return found
@@ -316,26 +339,6 @@ def _scale(text: str) -> float:
     if not 0.0 <= scale <= 10.0:
         raise ValueError(f'scale {text[:20]!r} of disturbances; allowed: 0 ... 10')
     return scale
-
-
-def _scaled(group: _Group, factor: float) -> Any:
-    changes: dict[str, Any] = {}
-    for each in fields(group):
-        kind, value = cast(Kind, each.metadata['kind']), getattr(group, each.name)
-        lowest, highest = _LIMITS[kind]
-        off = _OFF[kind]
-        numbers = value if isinstance(off, tuple) else (value,)
-        if kind == 'factor':
-            numbers = [number**factor for number in numbers]
-        elif kind == 'period':
-            numbers = [1 + round((number - 1) * factor) for number in numbers]
-        else:
-            numbers = [number * factor for number in numbers]
-            if kind == 'ticks':
-                numbers = [round(number) for number in numbers]
-        numbers = [min(max(number, lowest), highest) for number in numbers]
-        changes[each.name] = tuple(numbers) if isinstance(off, tuple) else numbers[0]
-    return dataclasses.replace(group, **changes)
 
 
 # `docs/robustness.md` gives the source of each range.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from typing import Any
 
@@ -33,8 +33,10 @@ _SPANS = {
     'object_latency': ('object', 'latency'),
     'object_period': ('object', 'period'),
     **{name: ('physics', name) for name in _PHYSICS if name != 'gravity_tilt'},
+    'gravity_tilt': ('physics', 'gravity_tilt'),
 }
-VARIATIONS = (*_SPANS, 'gravity_tilt', 'gravity_direction')
+# In the order in which an episode draws them.
+VARIATIONS = (*_SPANS, 'gravity_direction')
 # Topics computed from the joint sensors, and the sites whose poses they hold.
 _LED = {
     'end_effector_pose': ('robot0:grip',),
@@ -62,25 +64,29 @@ class Disturber:
         self.variations = {name: np.zeros(count) for name in VARIATIONS}
         is_angle = np.array([unit == 'rad' for unit in task.spec.robot.joint_units])
         self._angles = np.flatnonzero(is_angle)
-        self._widths = {
-            'action': size,
-            'joint': self._angles.size,
-            'velocity': self._angles.size,
-            'object': 6,
-            'push': 3,
-        }
-        ends = np.cumsum(list(self._widths.values()))
+        angle_dofs = task.joint_dofs[self._angles]
+        # The white noise and the bias of everything that has errors, side by side.
+        widths = {'action': size, 'joint': angle_dofs.size, 'velocity': angle_dofs.size}
+        widths |= {'object': 6, 'push': 3}
+        ends = np.cumsum(list(widths.values())).tolist()
         self._columns = {
-            name: slice(int(end) - width, int(end))
-            for (name, width), end in zip(self._widths.items(), ends, strict=True)
+            name: slice(end - width, end)
+            for (name, width), end in zip(widths.items(), ends, strict=True)
         }
+        self._bias_sizes = np.zeros(ends[-1])
+        self._bias_sizes[self._columns['action']] = disturbances.action.bias
+        self._bias_sizes[self._columns['joint']] = disturbances.joints.bias
+        tracked = disturbances.object
+        self._bias_sizes[self._columns['object']] = np.repeat(
+            [tracked.bias, tracked.rotation_bias], 3
+        )
         self._streams: list[np.random.Generator | None] = [None] * count
         self._tick = np.zeros(count, np.int64)
-        self._normal = np.zeros((count, _BLOCK, int(ends[-1])))
+        self._normal = np.zeros((count, _BLOCK, ends[-1]))
         self._uniform = np.zeros((count, _BLOCK, 5))
-        self._biases = {name: np.zeros((count, self._widths[name])) for name in self._widths}
+        self._biases = np.zeros((count, ends[-1]))
         self._start_shift = np.zeros((count, 2))
-        self._start_joints = np.zeros((count, self._angles.size))
+        self._start_joints = np.zeros((count, angle_dofs.size))
         self._lower, self._upper = command_limits(task.spec.robot)
         self._sent = np.zeros((MOST_TICKS + 1, count, size))
         self._applied = np.zeros((count, size))
@@ -94,13 +100,18 @@ class Disturber:
         self._pushed_body = first_body(task.model, names) or int(task.model.nbody - 1)
         gravity = float(np.linalg.norm(task.model.opt.gravity))
         self._weight = gravity * float(task.model.body_subtreemass[self._pushed_body])
-        joints = self.disturbances.joints
+        joints = disturbances.joints
         self._moves_joint_readings = bool(joints.noise or joints.bias or joints.resolution)
-        self._levers: dict[str, list[_Lever]] = {
-            name: [_Lever(task, site) for site in sites]
-            for name, sites in _LED.items()
-            if name in task.sensors and self._moves_joint_readings
-        }
+        # Of each topic the motion of each site, the joints that move it and their velocities.
+        self._levers: dict[str, list[tuple[SiteMotion, Ids, Ids]]] = {}
+        for name, sites in _LED.items():
+            if name in task.sensors and self._moves_joint_readings:
+                motions = [SiteMotion(task, task.model.site(site).id) for site in sites]
+                moving = [np.flatnonzero(np.isin(angle_dofs, each.dofs)) for each in motions]
+                self._levers[name] = [
+                    (motion, joints, angle_dofs[joints])
+                    for motion, joints in zip(motions, moving, strict=True)
+                ]
 
     # Episodes
 
@@ -108,9 +119,8 @@ class Disturber:
         """Make requested variations possible and return them as numbers, or raise ValueError."""
         named = entries('variation', given, VARIATIONS)
         wanted = {name: _variation(name, value) for name, value in named.items()}
-        for name in wanted:
-            if name in _PHYSICS:
-                self._physics.allow(name)
+        for name in wanted.keys() & set(_PHYSICS):
+            self._physics.allow(name)
         return wanted
 
     @property
@@ -149,34 +159,22 @@ class Disturber:
         uniform = stream.random(len(VARIATIONS))
         for name, share in zip(VARIATIONS, uniform.tolist(), strict=True):
             self.variations[name][index] = given.get(name, self._drawn(name, share))
-        spread = {
-            'action': self.disturbances.action.bias,
-            'joint': self.disturbances.joints.bias,
-        }
-        for name, values in self._biases.items():
-            values[index] = spread.get(name, 0.0) * stream.standard_normal(self._widths[name])
-        pose = self._biases['object'][index]
-        pose[:] = stream.standard_normal(6)
-        pose[:3] *= self.disturbances.object.bias
-        pose[3:] *= self.disturbances.object.rotation_bias
+        scatter = stream.standard_normal(self._bias_sizes.size + 6)
+        # The bias of the object is drawn last.
+        scatter[self._columns['object']] = scatter[-6:]
+        self._biases[index] = self._bias_sizes * scatter[:-6]
         self._start_shift[index] = stream.uniform(-1.0, 1.0, 2)
         self._start_joints[index] = stream.standard_normal(self._angles.size)
 
     def _drawn(self, name: str, share: float) -> float:
-        """A value from the range of a variation, `share` of the way through it."""
-        if name == 'gravity_tilt':
-            return share * self.disturbances.physics.gravity_tilt
+        """Return the value of a variation that is `share` of the way through its range."""
         if name == 'gravity_direction':
             return share * 2.0 * np.pi
         group, field_name = _SPANS[name]
         values = getattr(self.disturbances, group)
-        lowest, highest = getattr(values, field_name)
         kind = next(each.metadata['kind'] for each in fields(values) if each.name == field_name)
-        if kind in ('ticks', 'period'):
-            return float(lowest + int(share * (highest - lowest + 1)))
-        if kind == 'factor':
-            return float(lowest * (highest / lowest) ** share)
-        return float(lowest + share * (highest - lowest))
+        value = getattr(values, field_name)
+        return float(kind.drawn(value if kind.is_range else (0.0, value), share))
 
     def _draw_block(self, index: int) -> None:
         stream = self._streams[index]
@@ -209,36 +207,39 @@ class Disturber:
         self._tick += 1
         for index in np.flatnonzero(self._tick % _BLOCK == 0).tolist():
             self._draw_block(index)
-        action, row = self.disturbances.action, self._tick % _BLOCK
+        action = self.disturbances.action
         self._sent = np.roll(self._sent, 1, axis=0)
         self._sent[0] = commands
         delay = self.variations['action_latency'].astype(np.intp)
         arrived = self._sent[delay, self._all]
-        chance = self._uniform[self._all, row]
         kept = self._applied
-        if self._task.spec.robot.has_gripper_command:
-            dropped = np.zeros_like(kept)
-        else:
-            dropped = kept
-        arrived = np.where((chance[:, 0] < action.drop)[:, None], dropped, arrived)
-        self._applied = np.where((chance[:, 1] < action.repeat)[:, None], kept, arrived)
-        noise = action.noise * self._normal[self._all, row, self._columns['action']]
-        moved = noise + self._biases['action']
+        dropped = np.zeros_like(kept) if self._task.spec.robot.has_gripper_command else kept
+        arrived = np.where((self._chance(0) < action.drop)[:, None], dropped, arrived)
+        self._applied = np.where((self._chance(1) < action.repeat)[:, None], kept, arrived)
+        moved = self._error('action', action.noise)
         if not moved.any():
             return self._applied.astype(commands.dtype)
         half = (self._upper - self._lower) / 2.0
         disturbed = np.clip(self._applied + half * moved, self._lower, self._upper)
         return disturbed.astype(commands.dtype)
 
+    def _chance(self, number: int) -> Array:
+        """Return one of the five uniform random numbers of this tick, (N,)."""
+        return np.asarray(self._uniform[self._all, self._tick % _BLOCK, number])
+
+    def _error(self, name: str, noise: float | Array) -> Array:
+        """Return noise and bias of this tick, (N, columns)."""
+        columns = self._columns[name]
+        white = self._normal[self._all, self._tick % _BLOCK, columns]
+        return np.asarray(noise * white + self._biases[:, columns])
+
     def push(self, forces: Array) -> bool:
         """Add the pushes of this tick to (N, bodies, 6) wrenches; return whether there are any."""
         pushes = self.disturbances.pushes
         if not pushes.force:
             return False
-        row = self._tick % _BLOCK
-        per_tick = pushes.rate * self._task.tick_duration
-        pushed = self._uniform[self._all, row, 2] < per_tick
-        force = pushes.force * self._weight * self._normal[self._all, row, self._columns['push']]
+        pushed = self._chance(2) < pushes.rate * self._task.tick_duration
+        force = self._error('push', pushes.force * self._weight)
         forces[pushed, self._pushed_body, :3] += force[pushed]
         return bool(pushed.any())
 
@@ -284,25 +285,24 @@ class Disturber:
         return self._true[name][self.variations[latency].astype(np.intp), self._all]
 
     def _sense_joints(self, ids: Ids, true: Readings) -> None:
-        joints, row = self.disturbances.joints, self._tick % _BLOCK
+        joints = self.disturbances.joints
         measured = {
             name: self._delayed(name, 'joint_latency') for name in _JOINT_TOPICS if name in true
         }
         states, count = measured['joint_states'], len(self._task.spec.robot.joints)
         if joints.velocity_noise:
-            noise = self._normal[self._all, row, self._columns['velocity']]
-            states[:, count + self._angles] += joints.velocity_noise * noise
+            states[:, count + self._angles] += self._error('velocity', joints.velocity_noise)
         if self._moves_joint_readings:
-            error = joints.noise * self._normal[self._all, row, self._columns['joint']]
-            error += self._biases['joint']
+            error = self._error('joint', joints.noise)
             if joints.resolution:
                 exact = states[:, self._angles] + error
                 error += joints.resolution * np.round(exact / joints.resolution) - exact
             states[:, self._angles] += error
             for name, levers in self._levers.items():
-                for number, lever in enumerate(levers):
+                for number, (motion, moving, dofs) in enumerate(levers):
                     start = 7 * number
-                    measured[name][:, start : start + 3] += lever.displacement(error)
+                    shift, _ = motion.twist(dofs, error[:, moving])
+                    measured[name][:, start : start + 3] += shift
         for name, values in measured.items():
             self._held[name][ids] = values[ids]
 
@@ -310,17 +310,14 @@ class Disturber:
         names = [name for name in _OBJECT_TOPICS if name in true]
         if not names:
             return
-        tracked, row = self.disturbances.object, self._tick % _BLOCK
-        chance = self._uniform[self._all, row]
+        tracked = self.disturbances.object
         if not is_first:
             self._lost = np.maximum(self._lost - 1, 0)
-            self._lost[(chance[:, 3] < tracked.lost) & (self._lost == 0)] = _LOST_TICKS
+            self._lost[(self._chance(3) < tracked.lost) & (self._lost == 0)] = _LOST_TICKS
         is_fresh = self._tick % np.maximum(self.variations['object_period'], 1) == 0
-        is_fresh &= (chance[:, 4] >= tracked.stale) & (self._lost == 0)
+        is_fresh &= (self._chance(4) >= tracked.stale) & (self._lost == 0)
         fresh = ids if is_first else ids[is_fresh[ids]]
-        noise = self._normal[self._all, row, self._columns['object']]
-        error = noise * np.repeat([tracked.noise, tracked.rotation_noise], 3)
-        error = error + self._biases['object']
+        error = self._error('object', np.repeat([tracked.noise, tracked.rotation_noise], 3))
         for name in names:
             values = self._delayed(name, 'object_latency')
             if name != 'object_twist' and error.any():
@@ -346,17 +343,8 @@ class Disturber:
 
 
 _STATE = (
-    'variations',
-    '_streams',
-    '_tick',
-    '_normal',
-    '_uniform',
-    '_biases',
-    '_sent',
-    '_applied',
-    '_lost',
-    '_true',
-    '_held',
+    *('variations', '_streams', '_tick', '_normal', '_uniform', '_biases'),
+    *('_sent', '_applied', '_lost', '_true', '_held'),
 )
 
 
@@ -365,7 +353,7 @@ def _variation(name: str, value: Any) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
         raise ValueError(f'variation {name}={value!r:.40}; allowed: one finite number')
     if name != 'gravity_direction':
-        group, field_name = _SPANS.get(name, ('physics', name))
+        group, field_name = _SPANS[name]
         Disturbances.from_dict({group: {field_name: value}})
     return float(value)
 
@@ -378,91 +366,73 @@ def _turned(quaternion: Array, turn: Array) -> Array:
     return quaternion_multiply(rotation, quaternion)
 
 
-class _Lever:
-    """How far a site moves with the joints, to first order."""
-
-    def __init__(self, task: Task, site_name: str) -> None:
-        self._motion = SiteMotion(task, task.model.site(site_name).id)
-        dofs = task.joint_dofs[np.array(task.spec.robot.joint_units) == 'rad']
-        self._errors = np.flatnonzero(np.isin(dofs, self._motion.dofs))
-        self._dofs = dofs[self._errors]
-
-    def displacement(self, error: Array) -> Array:
-        """Return the shift (N, 3), m, for errors (N, angles) of the joints, rad."""
-        return self._motion.twist(self._dofs, error[:, self._errors])[0]
-
-
 # Physics of single simulations, by the batch's own model fields
-
-# Model fields that each variation changes.
-_FIELDS = {
-    'friction': ('geom_friction', 'pair_friction'),
-    'object_mass': (
-        'body_mass',
-        'body_inertia',
-        'body_subtreemass',
-        'body_invweight0',
-        'dof_invweight0',
-    ),
-    'object_size': ('geom_size', 'geom_rbound', 'geom_aabb', 'bvh_aabb'),
-    'gain': ('actuator_gainprm', 'actuator_biasprm'),
-    'force_limit': ('actuator_forcerange',),
-    'damping': ('dof_damping',),
-    'gravity_tilt': ('opt.gravity',),
-    'table_height': ('body_pos',),
-}
 
 
 class VariedPhysics:
-    """Writes the variations of each simulation into its own copy of some model fields."""
+    """Writes the variations of each simulation into its own copy of some model fields.
+
+    Attributes:
+        names: The variations that are possible.
+    """
 
     def __init__(self, task: Task, physics: PhysicsDisturbance) -> None:
         self._task = task
-        self._body = first_body(task.model, (task.spec.object_name,))
-        self._table = first_body(task.model, ('table0',))
+        model, body = task.model, first_body(task.model, (task.spec.object_name,))
+        table = first_body(model, ('table0',))
+        is_hand = not task.spec.robot.has_gripper_command
+        # Model fields that each variation changes, and their rows; empty if the task lacks them.
+        self._rows: dict[str, dict[str, Any]] = {
+            'friction': {'geom_friction': range(model.ngeom), 'pair_friction': range(model.npair)},
+            'object_mass': {},
+            'object_size': {},
+            'gain': dict.fromkeys(('actuator_gainprm', 'actuator_biasprm'), range(model.nu)),
+            'force_limit': {'actuator_forcerange': range(model.nu)},
+            'damping': {'dof_damping': task.joint_dofs.tolist()} if is_hand else {},
+            'gravity_tilt': {'opt.gravity': range(3)},
+            'table_height': {'body_pos': [table]} if table else {},
+        }
+        if body:
+            first, boxes = int(model.body_dofadr[body]), int(model.body_bvhadr[body])
+            self._rows['object_mass'] = {
+                'body_mass': [body],
+                'body_inertia': [body],
+                'body_subtreemass': [0, body],
+                'body_invweight0': [body],
+                'dof_invweight0': range(first, first + 6),
+            }
+            geoms = np.flatnonzero(model.geom_bodyid == body).tolist()
+            self._rows['object_size'] = {
+                **dict.fromkeys(('geom_size', 'geom_rbound', 'geom_aabb'), geoms),
+                'bvh_aabb': range(boxes, boxes + int(model.body_bvhnum[body])),
+            }
         self._live: dict[str, Array] = {}
         self._nominal: dict[str, Array] = {}
-        off = PhysicsDisturbance()
-        self._names = [name for name in _FIELDS if getattr(physics, name) != getattr(off, name)]
-        # A preset names what some tasks lack; it is then left out.
-        self._names = [name for name in self._names if self._has(name)]
-        for name in self._names:
-            self._expand(name)
+        self.names: list[str] = []
+        for each in fields(physics):
+            # A preset names what some tasks lack; it is then left out.
+            if getattr(physics, each.name) != each.default and self._has(each.name):
+                self.allow(each.name)
 
     def _has(self, name: str) -> bool:
-        if name.startswith('object_'):
-            return self._body > 0
-        if name == 'table_height':
-            return self._table > 0
-        if name in ('gain', 'force_limit'):
-            return bool(self._task.model.nu)
-        return name != 'damping' or not self._task.spec.robot.has_gripper_command
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The variations that are possible."""
-        return tuple(self._names)
+        return any(len(rows) for rows in self._rows[name].values())
 
     def allow(self, name: str) -> None:
         """Make a variation possible that is off by default, or raise ValueError."""
-        if name in self._names:
+        if name in self.names:
             return
         if not self._has(name):
             raise ValueError(f'{self._task.spec.name} has no {name} to vary')
-        self._expand(name)
-        self._names.append(name)
-
-    def _expand(self, name: str) -> None:
-        for field in _FIELDS[name]:
-            if field not in self._live:
-                try:
-                    self._live[field] = self._task.batch.expand(field)
-                except mujoco.FatalError:
-                    raise ValueError(
-                        f'{name} cannot vary after the model was shared or changed; vary it by the '
-                        'disturbances with which the simulation is made'
-                    ) from None
-                self._nominal[field] = self._live[field][0].copy()
+        for field in self._rows[name].keys() - self._live.keys():
+            try:
+                self._live[field] = self._task.batch.expand(field)
+            except mujoco.FatalError:
+                raise ValueError(
+                    f'{name} cannot vary after the model was shared or changed; vary it by the '
+                    'disturbances with which the simulation is made'
+                ) from None
+            self._nominal[field] = self._live[field][0].copy()
+        self.names.append(name)
 
     def restore(self, ids: Ids) -> None:
         """Give simulations the physics of the model."""
@@ -471,58 +441,32 @@ class VariedPhysics:
 
     def apply(self, ids: Ids, variations: Mapping[str, Array]) -> bool:
         """Write variations (N,) of simulations in nominal physics; return whether any are on."""
-        for name in self._names:
-            change: Callable[[Ids, Mapping[str, Array]], None] | None
-            change = getattr(self, f'_vary_{name}', None)
-            if change is not None:
-                change(ids, variations)
-            else:
-                self._multiply(ids, variations[name], dict.fromkeys(_FIELDS[name]))
-        return bool(self._names)
+        for name in self.names:
+            factors, live = variations[name][ids], self._live
+            for field, rows in self._rows[name].items():
+                values, places = live[field], np.ix_(ids, rows)
+                factor = factors.reshape((-1,) + (1,) * (values.ndim - 1))
+                if field == 'opt.gravity':
+                    values[ids] = self._tilted(factors, variations['gravity_direction'][ids])
+                elif field == 'body_pos':
+                    values[ids, rows[0], 2] += factors
+                elif field == 'body_subtreemass':
+                    values[places] += (factor - 1.0) * self._nominal['body_mass'][rows[1]]
+                elif field.endswith('invweight0'):
+                    # `mj_setConst` derives these for a free body.
+                    values[places] /= factor
+                else:
+                    values[places] *= factor
+        return bool(self.names)
 
-    def _multiply(
-        self, ids: Ids, factors: Array, fields: Mapping[str, NDArray[np.integer] | None]
-    ) -> None:
-        """Multiply some rows of model fields, or all (None), by the factors (N,)."""
-        for field, rows in fields.items():
-            values = self._live[field]
-            factor = factors[ids].reshape((-1,) + (1,) * (values.ndim - 1))
-            values[ids if rows is None else np.ix_(ids, rows)] *= factor
-
-    def _vary_object_mass(self, ids: Ids, variations: Mapping[str, Array]) -> None:
-        factor, body, live = variations['object_mass'][ids], self._body, self._live
-        added = (factor - 1.0) * self._nominal['body_mass'][body]
-        live['body_mass'][ids, body] *= factor
-        live['body_inertia'][ids, body] *= factor[:, None]
-        live['body_subtreemass'][ids, body] += added
-        live['body_subtreemass'][ids, 0] += added
-        # `mj_setConst` derives these for a free body.
-        live['body_invweight0'][ids, body] /= factor[:, None]
-        first = int(self._task.model.body_dofadr[body])
-        live['dof_invweight0'][ids, first : first + 6] /= factor[:, None]
-
-    def _vary_object_size(self, ids: Ids, variations: Mapping[str, Array]) -> None:
-        model = self._task.model
-        geoms = np.flatnonzero(model.geom_bodyid == self._body)
-        boxes = int(model.body_bvhadr[self._body]) + np.arange(int(model.body_bvhnum[self._body]))
-        fields = dict.fromkeys(('geom_size', 'geom_rbound', 'geom_aabb'), geoms)
-        self._multiply(ids, variations['object_size'], {**fields, 'bvh_aabb': boxes})
-
-    def _vary_damping(self, ids: Ids, variations: Mapping[str, Array]) -> None:
-        self._multiply(ids, variations['damping'], {'dof_damping': self._task.joint_dofs})
-
-    def _vary_gravity_tilt(self, ids: Ids, variations: Mapping[str, Array]) -> None:
-        tilt, direction = variations['gravity_tilt'][ids], variations['gravity_direction'][ids]
+    def _tilted(self, tilt: Array, direction: Array) -> Array:
+        """Return gravity (n, 3), m/s^2, for angles (n,) to the vertical and about it, rad."""
         strength = float(np.linalg.norm(self._nominal['opt.gravity']))
         across = np.sin(tilt) * strength
-        self._live['opt.gravity'][ids] = np.stack(
+        return np.stack(
             [across * np.cos(direction), across * np.sin(direction), -np.cos(tilt) * strength],
             axis=1,
         )
-
-    def _vary_table_height(self, ids: Ids, variations: Mapping[str, Array]) -> None:
-        shift = variations['table_height'][ids]
-        self._live['body_pos'][ids, self._table, 2] += shift
 
 
 def first_body(model: mujoco.MjModel, names: tuple[str | None, ...]) -> int:
