@@ -93,15 +93,6 @@ def test_layout_names_what_the_vector_holds(task):
         np.testing.assert_allclose(piece, expected[name], atol=1e-14, err_msg=name)
 
 
-def test_velocities_scale_with_the_tick():
-    task = TASKS['FetchReach']
-    vectors = vectors_of(task, random_tick(task))
-    slow = ObservationAssembler(task, 25.0).assemble(vectors)['observation']
-    fast = ObservationAssembler(task, 100.0).assemble(vectors)['observation']
-    np.testing.assert_allclose(slow[:5], fast[:5], rtol=0)
-    np.testing.assert_allclose(slow[5:], 4 * fast[5:])
-
-
 @pytest.mark.parametrize('task', TASKS.values(), ids=TASKS)
 def test_batches_equal_single_calls(task):
     ticks = [random_tick(task, seed) for seed in range(6)]
@@ -125,8 +116,3 @@ def test_needed_topics_are_needed(name):
         broken = np.full_like(vectors[missing], np.nan)
         with pytest.raises(ValueError, match=f'{missing}: (not every value is|no) finite'):
             assembler.assemble(vectors | {missing: broken})
-
-
-def test_rate_must_be_possible():
-    with pytest.raises(ValueError, match='control_hz 30 is not a whole number'):
-        ObservationAssembler(TASKS['FetchReach'], 30.0)

@@ -81,16 +81,6 @@ def test_quaternion_to_matrix_equals_mujoco():
     assert_same_bits(rotations.quaternion_to_matrix(quaternions).reshape(COUNT, 9), expected)
 
 
-def test_quaternion_from_axis_angle_equals_mujoco():
-    generator = np.random.default_rng(2)
-    axes, angles = generator.normal(size=(COUNT, 3)), generator.uniform(-6, 6, size=COUNT)
-    expected = np.empty((COUNT, 4))
-    for axis, angle, quaternion in zip(axes, angles, expected, strict=True):
-        mujoco.mju_axisAngle2Quat(quaternion, axis / np.linalg.norm(axis), angle)
-    ours = rotations.quaternion_from_axis_angle(axes, angles)
-    np.testing.assert_allclose(ours, expected, atol=1e-15)
-
-
 def test_quaternion_from_axis_angle_equals_the_reference_to_the_last_bit():
     """As the reference draws the start of an object: one by one."""
     generator = np.random.default_rng(7)

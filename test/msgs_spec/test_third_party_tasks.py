@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -19,27 +20,26 @@ def test_an_episode_has_a_tick_at_any_rate(monkeypatch: pytest.MonkeyPatch) -> N
     assert task_spec(PUSH.name, control_hz=12.5).episode_ticks == 1
 
 
-class Package:
-    """An entry point of a third-party package."""
+@dataclass
+class Point:
+    """An entry point of a third-party package, with the name of its task."""
 
-    def __init__(self, package: str, name: str, given: object) -> None:
-        self.dist = self
-        self.name, self.value = package, f'{package}:{name}'
-        self._given = given
+    package: str
+    name: str
+    given: Any
 
-    def load(self) -> object:
-        if isinstance(self._given, BaseException):
-            raise self._given
-        return self._given
+    @property
+    def dist(self) -> SimpleNamespace:
+        return SimpleNamespace(name=self.package)
 
+    @property
+    def value(self) -> str:
+        return f'{self.package}:{self.name}'
 
-class Point(Package):
-    """With the name of its task."""
-
-    def __init__(self, package: str, name: str, given: object) -> None:
-        super().__init__(package, name, given)
-        self.dist = Package(package, name, given)
-        self.name = name
+    def load(self) -> Any:
+        if isinstance(self.given, BaseException):
+            raise self.given
+        return self.given
 
 
 @pytest.fixture
