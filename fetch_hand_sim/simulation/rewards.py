@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from msgs_spec.arrays import Array
+from msgs_spec.robots import FINGERTIPS
 from msgs_spec.rotations import euler_to_quaternion, quaternion_to_euler, rotation_angle
 from msgs_spec.tasks import REWARD_TYPES, SUCCESS_RULES, GoalKind, RewardType, SuccessRule, TaskSpec
 from msgs_spec.text import one_of
@@ -84,7 +85,8 @@ class GoalMetric:
             distance = _norm(place) if self.spec.position_counts else nothing
             return distance, self._rotation(achieved, desired)
         if self.spec.goal is GoalKind.FINGERTIPS and self.success_rule == 'paper':
-            fingertips = (achieved - desired).reshape(*achieved.shape[:-1], -1, 3)
+            # Not -1, which fails for an empty batch.
+            fingertips = (achieved - desired).reshape(*achieved.shape[:-1], len(FINGERTIPS), 3)
             per_fingertip = np.moveaxis(_norm(fingertips), -1, 0)
             return np.asarray(sum(per_fingertip) / len(per_fingertip)), nothing
         return _norm(achieved - desired), nothing

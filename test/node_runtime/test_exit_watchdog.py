@@ -27,10 +27,9 @@ def run(limit: float, code: int, held: float) -> tuple[int, str, float]:
     return ended.returncode, ended.stdout.decode(), time.monotonic() - started
 
 
-@pytest.mark.parametrize('code', [0, 130])
-def test_a_process_that_is_held_ends_with_its_own_exit_code(code: int) -> None:
-    ended, output, seconds = run(0.3, code, held=20.0)
-    assert (ended, output) == (code, 'done\n')
+def test_a_process_that_is_held_ends_with_its_own_exit_code() -> None:
+    ended, output, seconds = run(0.3, 130, held=20.0)
+    assert (ended, output) == (130, 'done\n')
     assert seconds < 10.0
 
 

@@ -39,6 +39,8 @@ def test_at_25_hz_nothing_depends_on_the_timing(task):
     assert first == second
     assert simulations[0].spec == TASKS[task]
     assert lead_scale(25.0) == 1.0
+    copied = pickle.loads(pickle.dumps(simulations[1]))
+    assert copied.timing == 'ticks'
 
 
 def speed(control_hz: float, timing: str, command: float = 1.0) -> float:
@@ -81,49 +83,37 @@ def test_an_episode_is_as_long_in_seconds():
         assert old.spec.episode_ticks == 50
 
 
-def test_a_pickled_simulation_keeps_its_timing():
-    simulation = Simulation('FetchReach', num_threads=1, control_hz=250.0, timing='ticks')
-    simulation.reset(seed=0)
-    copy = pickle.loads(pickle.dumps(simulation))
-    assert copy.timing == 'ticks'
-    action = [[1.0, 0.0, 0.0, 0.0]]
-    first, second = (each.step(action).observation for each in (simulation, copy))
-    assert first['observation'].tobytes() == second['observation'].tobytes()
-
-
 def test_environments_are_truncated_after_the_seconds_of_an_episode():
     name = environment_id('FetchReach')
-    for rate, ticks in ((25, 50), (250, 500)):
-        assert fetch_hand_sim.make(name, control_hz=rate).spec.max_episode_steps == ticks
-    short = fetch_hand_sim.make(f'fetch_hand_sim:{name}', control_hz=250, max_episode_steps=3)
-    assert short.spec.max_episode_steps == 3
-    unsaid = fetch_hand_sim.make(name, control_hz=250, max_episode_steps=None)
-    assert unsaid.spec.max_episode_steps == 500
+    for made, ticks in (
+        (fetch_hand_sim.make(name, control_hz=25), 50),
+        (fetch_hand_sim.make(name, control_hz=250, max_episode_steps=None), 500),
+        (fetch_hand_sim.make(f'fetch_hand_sim:{name}', control_hz=250, max_episode_steps=3), 3),
+        (slow := fetch_hand_sim.make(name, control_hz=12.5), 25),
+        (fetch_hand_sim.make(slow.spec), 25),
+        (fetch_hand_sim.make(slow.spec, control_hz=25), 50),
+        (fetch_hand_sim.make_vec(slow.spec, 2), 25),
+    ):
+        assert made.spec.max_episode_steps == ticks
+    with pytest.warns(UserWarning, match='latest versioned environment'):
+        unversioned = fetch_hand_sim.make(name.removesuffix('-v0'), control_hz=12.5)
+    assert unversioned.spec.max_episode_steps == 25
     env, ended = fetch_hand_sim.make_vec(name, num_envs=2, control_hz=12.5), []
     env.reset(seed=0)
     for _ in range(25):
         *_, truncated, _ = env.step(np.zeros((2, 4), np.float32))
         ended.append(truncated.all())
     assert ended == [False] * 24 + [True]
-    env.close()
 
 
-def test_make_takes_whatever_gymnasium_takes(tmp_path, monkeypatch):
-    name = environment_id('FetchReach')
-    slow = fetch_hand_sim.make(name, control_hz=12.5)
-    assert fetch_hand_sim.make(slow.spec).spec.max_episode_steps == 25
-    assert fetch_hand_sim.make(slow.spec, control_hz=25).spec.max_episode_steps == 50
-    assert fetch_hand_sim.make_vec(slow.spec, 2).spec.max_episode_steps == 25
-    with pytest.warns(UserWarning, match='latest versioned environment'):
-        unversioned = fetch_hand_sim.make(name.removesuffix('-v0'), control_hz=12.5)
-    assert unversioned.spec.max_episode_steps == 25
-    # An id that only the module before the colon registers.
+def test_an_id_may_be_registered_by_the_module_before_its_colon(tmp_path, monkeypatch):
     (tmp_path / 'somebodys_ids.py').write_text(
         "import gymnasium\ngymnasium.register('Somebodys-v0', 'gymnasium.envs.classic_control:"
         "CartPoleEnv')\n"
     )
     monkeypatch.syspath_prepend(tmp_path)
     try:
-        assert fetch_hand_sim.make('somebodys_ids:Somebodys-v0').spec.id == 'Somebodys-v0'
+        made = fetch_hand_sim.make('somebodys_ids:Somebodys-v0')
+        assert made.spec.id == 'Somebodys-v0'
     finally:
         gymnasium.registry.pop('Somebodys-v0', None)

@@ -60,35 +60,35 @@ def test_any_batch_equals_the_single_call_bit_for_bit(task, reward_type, success
     reversed_rows = measure.reward(achieved[::-1], desired[::-1])
     assert reversed_rows[::-1].tobytes() == single.tobytes()
     assert measure.evaluate(achieved, desired)[0].tobytes() == single.tobytes()
-
-
-@pytest.mark.parametrize('task', TASKS)
-def test_float32_goals_count_as_the_float64_values_they_hold(task):
-    measure = metric(task, reward_type='dense')
-    narrow = [goals.astype(np.float32) for goals in random_goals(TASKS[task], 20)]
+    narrow = [goals.astype(np.float32) for goals in (achieved, desired)]
     wide = [goals.astype(np.float64) for goals in narrow]
     assert measure.reward(*narrow).tobytes() == measure.reward(*wide).tobytes()
+    assert measure.reward(achieved[:0], desired[:0]).shape == (0,)
+    unknown = np.full_like(desired, np.nan)
+    assert not measure.success(achieved, unknown).any()
+    if reward_type == 'sparse':
+        assert (measure.reward(achieved, unknown) == -1.0).all()
 
 
-@pytest.mark.parametrize('task', TASKS)
-def test_an_empty_batch_has_no_rewards(task):
-    empty = np.zeros((0, TASKS[task].goal.size))
-    assert metric(task).reward(empty, empty).shape == (0,)
-
-
-def test_fetch_is_rewarded_within_five_centimetres():
-    measure = metric('FetchPush')
-    offsets = np.array([[0.0, 0.0, 0.0], [0.03, 0.0, 0.03], [0.0, 0.051, 0.0]])
-    assert measure.reward(offsets, np.zeros((3, 3))).tolist() == [0.0, 0.0, -1.0]
-    dense = metric('FetchPush', reward_type='dense').reward(offsets, np.zeros((3, 3)))
-    assert dense == pytest.approx(-np.linalg.norm(offsets, axis=1))
-
-
-@pytest.mark.parametrize('task', TASKS)
-def test_a_goal_that_is_not_a_number_is_never_reached(task):
-    goal = np.full(TASKS[task].goal.size, np.nan)
-    assert metric(task).reward(goal, goal) == -1.0
-    assert not metric(task).success(goal, goal)
+@pytest.mark.parametrize(
+    ('task', 'near', 'far'),
+    [
+        ('FetchPush', [0.03, 0.0, 0.03], [0.0, 0.051, 0.0]),
+        ('FetchPush', [0.05, 0.0, 0.0], [0.0501, 0.0, 0.0]),
+        (
+            'HandManipulateEggRotate',
+            [0.5, 0.0, 0.0, *quaternion_from_axis_angle([0.0, 1.0, 0.0], 0.09)],
+            pose(quaternion=quaternion_from_axis_angle([0.0, 1.0, 0.0], 0.11)),
+        ),
+    ],
+)
+def test_goals_count_within_the_threshold(task, near, far):
+    goal = pose() if len(near) == 7 else np.zeros(3)
+    for rule in ('gymnasium', 'paper'):
+        assert metric(task, rule).reward([near, far], [goal, goal]).tolist() == [0.0, -1.0]
+    if len(near) == 3:
+        dense = metric(task, reward_type='dense').reward(near, goal)
+        assert dense == pytest.approx(-np.linalg.norm(near))
 
 
 def test_fingertips_by_the_norm_of_all_or_by_their_mean_distance():
@@ -108,13 +108,6 @@ def test_opposite_quaternions_are_one_rotation_only_in_the_paper(task):
     assert not metric(task).success(*goals)
     assert metric(task, reward_type='dense').reward(*goals) == pytest.approx(-2 * np.pi)
     assert metric(task, 'paper').success(*goals)
-
-
-@pytest.mark.parametrize('angle', [0.09, 0.11])
-def test_rotations_count_within_a_tenth_of_a_radian(angle):
-    turned = pose(quaternion=quaternion_from_axis_angle([0.0, 1.0, 0.0], angle))
-    for rule in ('gymnasium', 'paper'):
-        assert metric('HandManipulateEggRotate', rule).success(turned, pose()) == (angle < 0.1)
 
 
 def test_rotate_tasks_ignore_the_position_and_full_tasks_do_not():
@@ -176,23 +169,15 @@ class Scaled(GoalMetric):
         return -self.scale * self.distances(achieved_goal, desired_goal)[0]
 
 
-@dataclass(frozen=True)
-class ScaledField(GoalMetric):
-    """With a parameter that is a field."""
-
-    scale: float = 1.0
-    reward = Scaled.reward
-
-
 @dataclass(frozen=True, slots=True)
 class ScaledSlot(GoalMetric):
-    """Likewise, without a dictionary of its own."""
+    """With a parameter that is a field, without a dictionary of its own."""
 
     scale: float = 1.0
     reward = Scaled.reward
 
 
-@pytest.mark.parametrize('kind', [Scaled, ScaledField, ScaledSlot])
+@pytest.mark.parametrize('kind', [Scaled, ScaledSlot])
 def test_a_parameter_of_a_metric_of_its_own_outlives_changes_copies_and_pickles(kind):
     spec = TASKS['FetchPush']
     mine = kind(spec, scale=0.5)

@@ -69,16 +69,16 @@ def test_the_nth_episode_of_a_seed_equals_the_first(task):
 
 @each_task
 def test_neither_neighbours_nor_threads_change_a_bit(task):
-    batch = Simulation(task, num_envs=64, num_threads=1)
-    threaded = Simulation(task, num_envs=64, num_threads=3)
+    batch = Simulation(task, num_envs=24, num_threads=1)
+    threaded = Simulation(task, num_envs=24, num_threads=3)
     single = Simulation(task, num_envs=1)
     played = actions(batch, 6)
     for simulation in (batch, threaded):
         simulation.reset(seed=100)
-    single.reset(seed=137)
+    single.reset(seed=117)
     expected = play(batch, played)
     assert play(threaded, played).tobytes() == expected.tobytes()
-    assert play(single, played[:, 37:38]).tobytes() == expected[:, 37:38].tobytes()
+    assert play(single, played[:, 17:18]).tobytes() == expected[:, 17:18].tobytes()
 
 
 @pytest.mark.parametrize(('may_use', 'num_envs', 'threads'), [(1, 3, 1), (4, 3, 3), (2, 3, 2)])
@@ -163,10 +163,6 @@ def test_commands_in_radians_equal_normalised_actions():
     expected = by_action.step(action).observation['observation']
     result = by_command.step_commands(command_from_action(by_command.spec.robot, action))
     assert result.observation['observation'].tobytes() == expected.tobytes()
-
-
-def test_it_says_what_it_is():
-    assert repr(Simulation('FetchPush', num_envs=2)) == "Simulation('FetchPush', num_envs=2)"
 
 
 BAD_SIMULATIONS = {
@@ -378,13 +374,13 @@ def test_memory_does_not_grow_with_episodes(task):
 
     def run_episodes() -> int:
         reset_peak_memory()
-        for _ in range(150):
+        for _ in range(60):
             simulation.reset()
             play(simulation, played)
         return peak_memory()
 
     before = run_episodes()
-    assert run_episodes() - before < 4_000_000, 'bytes that 150 more episodes took'
+    assert run_episodes() - before < 1_600_000, 'bytes that 60 more episodes took'
 
 
 @pytest.mark.parametrize('task', ['FetchPush', 'HandReach', 'HandManipulateEggFull'])
@@ -402,58 +398,36 @@ def test_a_simulation_frees_its_memory_when_nobody_has_it_any_more(task):
 
 
 FORKED = """
-import copy, multiprocessing
-import numpy as np
-from fetch_hand_sim.simulation import Simulation
-
-def play(simulation):
-    for each in (simulation, copy.deepcopy(simulation)):
-        for call in (lambda: each.step(np.zeros((2, 4))), lambda: each.reset(seed=1)):
-            try:
-                call()
-                print('goes on', flush=True)
-            except RuntimeError as error:
-                print(str(error)[:23], flush=True)
-
-simulation = Simulation('FetchReach', num_envs=2, num_threads=THREADS)
-simulation.reset(seed=0)
-child = multiprocessing.get_context('fork').Process(target=play, args=(simulation,))
-child.start()
-child.join(60)
-child.kill()
-"""
-
-
-@pytest.mark.parametrize(('threads', 'refused'), [(1, 0), (2, 2)])
-def test_threads_that_a_fork_leaves_behind_are_not_waited_for(threads, refused):
-    script = FORKED.replace('THREADS', str(threads))
-    result = subprocess.run([sys.executable, '-c', script], capture_output=True, text=True)
-    expected = ['this process was forked'] * refused + ['goes on'] * (4 - refused)
-    assert result.stdout.splitlines() == expected, result.stderr
-
-
-LEFT_BEHIND = """
 import copy, os, signal
 import numpy as np
 from fetch_hand_sim.simulation import Simulation
 
-simulation = Simulation('FetchReach', num_envs=2, num_threads=2)
-simulation.reset(seed=0)
-if os.fork() == 0:
-    signal.alarm(60)
-    simulation = {replacement}
-    if simulation is not None:
+def play(simulation):
+    for call in (lambda: simulation.step(np.zeros((2, 4))), lambda: simulation.reset(seed=1)):
+        try:
+            call()
+            print('goes on', flush=True)
+        except RuntimeError as error:
+            print(str(error)[:23], flush=True)
+
+for threads in (1, 2):
+    simulation = Simulation('FetchReach', num_envs=2, num_threads=threads)
+    simulation.reset(seed=0)
+    if os.fork() == 0:
+        signal.alarm(60)
+        play(simulation)
+        simulation = copy.deepcopy(simulation)
+        play(simulation)
+        # A new batch replaces the copy.
+        simulation = Simulation('FetchReach', num_envs=2, num_threads=2)
         simulation.reset(seed=1)
-        simulation.step(np.zeros((2, 4)))
-else:
+        break
     assert os.wait()[1] == 0
 """
 
 
-@pytest.mark.parametrize(
-    'replacement', ['None', 'copy.deepcopy(simulation)', 'Simulation("FetchReach", 2, 2)']
-)
-def test_a_forked_process_may_drop_a_batch(replacement):
-    script = LEFT_BEHIND.format(replacement=replacement)
-    result = subprocess.run([sys.executable, '-c', script], capture_output=True, text=True)
-    assert result.returncode == 0, result.stderr
+def test_threads_that_a_fork_leaves_behind_are_not_waited_for():
+    result = subprocess.run([sys.executable, '-c', FORKED], capture_output=True, text=True)
+    forked = 'this process was forked'
+    expected = ['goes on'] * 4 + [forked, forked, 'goes on', 'goes on']
+    assert (result.returncode, result.stdout.splitlines()) == (0, expected), result.stderr

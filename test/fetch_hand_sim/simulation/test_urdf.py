@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ElementTree
 from io import StringIO
+from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
 import mujoco
@@ -13,11 +14,9 @@ import pytest
 from fetch_hand_sim.simulation.scene import Scene
 from fetch_hand_sim.simulation.urdf import ROOT, RobotDescription, roll_pitch_yaw
 from msgs_spec.rotations import quaternion_to_matrix
-from msgs_spec.tasks import TASKS, task_spec
 
 TASKS_OF_ROBOTS = ['FetchReach', 'HandReach']
 COLORS = {'FetchReach': 5, 'HandReach': 2}
-CONFIGURATIONS = 30
 
 
 @pytest.fixture(scope='module', params=TASKS_OF_ROBOTS)
@@ -25,27 +24,8 @@ def robot(request):
     return RobotDescription(request.param), Scene(request.param)
 
 
-def configurations(scene):
-    """Random joint positions within limits, by name, and the model's data posed likewise."""
-    rng = np.random.default_rng(0)
-    model, data = scene.model, scene.data
-    for _ in range(CONFIGURATIONS):
-        positions = {}
-        for name in scene.spec.robot.joints:
-            joint = model.joint(name)
-            lower, upper = joint.range if model.jnt_limited[joint.id] else (-1.0, 1.0)
-            positions[name] = rng.uniform(lower, upper)
-            data.qpos[joint.qposadr[0]] = positions[name]
-        mujoco.mj_kinematics(model, data)
-        yield positions, data
-
-
-def bodies(description, scene):
-    names = {scene.model.body(index).name for index in range(scene.model.nbody)}
-    return [joint.child for joint in description.joints if joint.child in names]
-
-
-def test_a_library_finds_every_body_where_mujoco_has_it(robot):
+def test_every_body_is_where_mujoco_has_it(robot):
+    """By a library that reads the URDF, and by our own kinematics."""
     yourdfpy = pytest.importorskip('yourdfpy')
     description, scene = robot
     urdf = yourdfpy.URDF.load(
@@ -54,24 +34,30 @@ def test_a_library_finds_every_body_where_mujoco_has_it(robot):
     assert set(urdf.actuated_joint_names) == set(scene.spec.robot.joints)
     names = bodies(description, scene)
     assert len(names) > 15
-    for positions, data in configurations(scene):
+    rng, model, data = np.random.default_rng(0), scene.model, scene.data
+    joints = [model.joint(name) for name in scene.spec.robot.joints]
+    for _ in range(8):
+        positions = {
+            joint.name: rng.uniform(*(joint.range if joint.limited else (-1.0, 1.0)))
+            for joint in joints
+        }
+        for joint in joints:
+            data.qpos[joint.qposadr[0]] = positions[joint.name]
+        mujoco.mj_kinematics(model, data)
         urdf.update_cfg(positions)
-        for name in names:
-            found = urdf.get_transform(name, ROOT)
-            body = data.body(name)
-            np.testing.assert_allclose(found[:3, 3], body.xpos, atol=1e-6)
-            np.testing.assert_allclose(found[:3, :3].ravel(), body.xmat, atol=1e-6)
-
-
-def test_our_own_kinematics_are_the_same(robot):
-    description, scene = robot
-    names = bodies(description, scene)
-    for positions, data in configurations(scene):
         poses = description.poses(positions)
         for name in names:
-            np.testing.assert_allclose(poses[name].position, data.body(name).xpos, atol=1e-9)
-            found = quaternion_to_matrix(poses[name].quaternion).ravel()
-            np.testing.assert_allclose(found, data.body(name).xmat, atol=1e-9)
+            found, body = urdf.get_transform(name, ROOT), data.body(name)
+            np.testing.assert_allclose(found[:3, 3], body.xpos, atol=1e-6)
+            np.testing.assert_allclose(found[:3, :3].ravel(), body.xmat, atol=1e-6)
+            np.testing.assert_allclose(poses[name].position, body.xpos, atol=1e-9)
+            turn = quaternion_to_matrix(poses[name].quaternion)
+            np.testing.assert_allclose(turn.ravel(), body.xmat, atol=1e-9)
+
+
+def bodies(description, scene):
+    names = {scene.model.body(index).name for index in range(scene.model.nbody)}
+    return [joint.child for joint in description.joints if joint.child in names]
 
 
 def test_masses_and_limits_are_those_of_the_model(robot):
@@ -92,14 +78,15 @@ def test_masses_and_limits_are_those_of_the_model(robot):
                 np.testing.assert_allclose(found, known.range, atol=1e-7)
 
 
-def test_meshes_are_the_installed_files(robot):
-    description, _ = robot
-    files = {
-        mesh.get('filename') for mesh in ElementTree.fromstring(description.to_xml()).iter('mesh')
-    }
+def test_links_and_joints_take_prefixes_and_meshes_are_the_installed_files(robot):
+    description, scene = robot
+    root = ElementTree.fromstring(description.to_xml('left/', 'rh_'))
+    first, *names = [link.get('name') for link in root.findall('link')]
+    assert first == ROOT and all(name.startswith('left/') for name in names)
+    moving = {each.get('name') for each in root.findall('joint') if each.get('type') != 'fixed'}
+    assert moving == set(scene.spec.with_joint_prefix('rh_').robot.joints)
+    files = {mesh.get('filename') for mesh in root.iter('mesh')}
     assert files
-    from pathlib import Path
-
     for file in files:
         assert file.startswith('file:///') and 'gymnasium_robotics' in file
         assert Path(unquote(urlsplit(file).path)).is_file()
@@ -176,20 +163,3 @@ def test_angles_give_the_rotation_back(seed):
     roll, pitch, yaw = roll_pitch_yaw(quaternion)
     turn = rotation('z', yaw) @ rotation('y', pitch) @ rotation('x', roll)
     np.testing.assert_allclose(turn, quaternion_to_matrix(quaternion), atol=1e-7)
-
-
-def test_frames_of_several_robots_have_a_prefix():
-    description = RobotDescription('HandReach')
-    root = ElementTree.fromstring(description.to_xml('left/'))
-    names = [link.get('name') for link in root.findall('link')]
-    assert names[0] == ROOT and all(name.startswith('left/') for name in names[1:])
-    assert {joint.get('name') for joint in root.findall('joint')} >= set(
-        TASKS['HandReach'].robot.joints
-    )
-
-
-def test_joints_have_the_names_of_joint_states():
-    spec = task_spec('HandReach', 'rh_')
-    root = ElementTree.fromstring(RobotDescription('HandReach').to_xml(joint_prefix='rh_'))
-    moving = [each.get('name') for each in root.findall('joint') if each.get('type') != 'fixed']
-    assert set(moving) == set(spec.robot.joints)
