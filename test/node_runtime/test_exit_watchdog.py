@@ -7,8 +7,6 @@ import subprocess
 import sys
 import time
 
-import pytest
-
 # A library that spins: `PyDLL` does not release the lock of the interpreter.
 HELD = """
 import ctypes, time

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import fetch_hand_sim
-from fetch_hand_sim.gym_envs.gymnasium_robotics_env import FetchEnv, ManipulateEnv, import_goal_env
+from fetch_hand_sim.gym_envs.gymnasium_robotics_env import FetchEnv, ManipulateEnv
 from fetch_hand_sim.gym_envs.registration import reference_ids
 from msgs_spec.tasks import TASKS
 from support import SUPPORT
@@ -143,18 +143,6 @@ def test_a_worker_process_finds_the_ids_by_their_module():
     assert fetch_hand_sim.make(name, control_hz=50).spec.max_episode_steps == 100
 
 
-def test_an_environment_is_a_goal_env_and_recomputes_its_step(make):
-    env = make('FetchReach-v4')
-    assert isinstance(env, import_goal_env())
-    env.reset(seed=0)
-    observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
-    goals = observation['achieved_goal'], observation['desired_goal']
-    assert reward == env.compute_reward(*goals, info)
-    assert terminated == env.compute_terminated(*goals, info)
-    assert truncated == env.compute_truncated(*goals, info)
-    assert env.compute_reward(goals[0], goal=goals[0], info=info) == 0.0
-
-
 def test_thresholds_goals_and_reward_types_can_be_set(make):
     env = make('HandReach-v3', distance_threshold=1e-6)
     env.reset(seed=0)
@@ -181,13 +169,6 @@ def test_goals_of_the_same_object_can_be_asked_for(make):
         make('HandManipulateEgg-v1', target_rotation='parallel')
     with pytest.raises(ValueError, match="task 'FetchReach'; allowed: Hand"):
         ManipulateEnv('FetchReach')
-
-
-def test_gymnasium_makes_lists_of_pictures(make):
-    make('FetchReach-v4')
-    env = gymnasium.make('FetchReach-v4', render_mode='rgb_array_list')
-    assert isinstance(env, gymnasium.wrappers.RenderCollection)
-    assert env.unwrapped.render_mode == 'rgb_array'
 
 
 def test_a_batch_takes_and_gives_what_single_environments_do(make):
@@ -238,35 +219,7 @@ def test_hooks_that_nothing_asks_are_refused(make):
         make('FetchReach-v4')._set_action = None
 
 
-@pytest.mark.parametrize('name', ['FetchPickAndPlace-v4', 'HandManipulateEggRotate-v1'])
-@pytest.mark.parametrize(
-    ('duplicate', 'is_looked_at'),
-    [(copy.deepcopy, True), (lambda env: pickle.loads(pickle.dumps(env)), False)],
-)
-def test_a_copy_goes_on_to_the_same_bits(name, duplicate, is_looked_at, make):
-    make(name)
-    env = gymnasium.make(name)
-    env.reset(seed=4)
-    env.action_space.seed(0)
-    for _ in range(3):
-        env.step(env.action_space.sample())
-    env.unwrapped.distance_threshold = 0.5
-    twin = duplicate(env)
-    if is_looked_at:
-        assert twin.unwrapped.data.time == env.unwrapped.data.time
-    for _ in range(3):
-        action = env.action_space.sample()
-        first, second = env.step(action), twin.step(action)
-        assert first[1:] == second[1:]
-        for key, values in first[0].items():
-            assert values.tobytes() == second[0][key].tobytes()
-    # The random generators go on alike too, and apart.
-    first, second = env.reset()[0], twin.reset()[0]
-    assert first['desired_goal'].tobytes() == second['desired_goal'].tobytes()
-    assert twin.unwrapped.distance_threshold == 0.5
-
-
-def test_what_is_written_into_the_data_is_the_simulation(make):
+def test_what_is_written_into_data_and_model_is_the_simulation(make):
     env, other = make('FetchPush-v4'), make('FetchPush-v4')
     env.reset(seed=0)
     other.reset(seed=1)
@@ -276,24 +229,53 @@ def test_what_is_written_into_the_data_is_the_simulation(make):
     other.goal = env.goal
     for key, values in env._get_obs().items():
         assert np.abs(values - other._get_obs()[key]).max() < 1e-12, key
-    held = other.data
-    before = held.time
-    other.step(np.ones(4, dtype=np.float32))
+    held, before = other.data, other.data.time
+    other.model.opt.timestep = 0.001
+    other.model.body('object0').mass *= 50.0
+    copied = copy.deepcopy(other)
+    twin = pickle.loads(pickle.dumps(other))
+    assert twin.model.body('object0').mass == other.model.body('object0').mass
+    moved = []
+    for each in (env, other, copied, twin):
+        each.data.joint('object0:joint').qvel[0] = 1.0
+        each.data.qfrc_applied[-6] = 5.0
+        observation = each.step(np.ones(4, np.float32))[0]['observation']
+        moved.append(each.data.joint('object0:joint').qvel[0])
+        velocity = each.simulation.readings()['end_effector_twist'][0, :3]
+        assert np.array_equal(observation[20:23], velocity * each.dt)
     assert held is other.data
-    assert held.time == pytest.approx(before + other.dt)
+    assert held.time == pytest.approx(before + 0.02)
+    assert [each.dt for each in (env, other, copied, twin)] == [0.04, 0.02, 0.02, 0.02]
+    assert moved[1] == moved[2] == moved[3]
+    assert abs(moved[0] - moved[1]) > 0.1
+    # Goals are drawn around the place of the object.
+    hand = make('HandManipulateBlock-v1')
+    hand.reset(seed=0)
+    hand.data.joint('object:joint').qpos[:3] = 2.0
+    assert np.abs(hand._sample_goal()[:3] - 2.0).max() < 0.5
 
 
-def test_another_time_step_is_that_of_dt_and_of_observed_velocities(make):
-    env = make('FetchPush-v4')
-    env.reset(seed=0)
-    env.model.opt.timestep = 0.001
-    assert env.dt == 0.02
-    before = env.data.time
-    observation = env.step(np.ones(4, np.float32))[0]['observation']
-    assert env.data.time - before == pytest.approx(0.02)
-    velocity = env.simulation.readings()['end_effector_twist'][0, :3]
-    assert np.array_equal(observation[20:23], velocity * 0.02)
-    assert copy.deepcopy(env).dt == 0.02
+@pytest.mark.parametrize('name', ['FetchPickAndPlace-v4', 'HandManipulateEggRotate-v1'])
+def test_a_copy_goes_on_to_the_same_bits(name, make):
+    make(name)
+    env = gymnasium.make(name)
+    env.reset(seed=4)
+    env.action_space.seed(0)
+    env.step(env.action_space.sample())
+    env.unwrapped.distance_threshold = 0.5
+    twins = copy.deepcopy(env), pickle.loads(pickle.dumps(env))
+    assert twins[0].unwrapped.data.time == env.unwrapped.data.time
+    for _ in range(3):
+        action = env.action_space.sample()
+        expected, *others = (each.step(action) for each in (env, *twins))
+        for other in others:
+            assert other[1:] == expected[1:]
+            for key, values in expected[0].items():
+                assert values.tobytes() == other[0][key].tobytes()
+    # The random generators continue alike, and apart.
+    goals = [each.reset()[0]['desired_goal'].tobytes() for each in (env, *twins)]
+    assert goals[0] == goals[1] == goals[2]
+    assert twins[1].unwrapped.distance_threshold == 0.5
 
 
 def test_the_helpers_of_the_reference_work_on_model_and_data(make):
@@ -314,29 +296,6 @@ def test_the_helpers_of_the_reference_work_on_model_and_data(make):
     env._utils.set_joint_qpos(env.model, env.data, 'object0:joint', place)
     env._mujoco.mj_forward(env.model, env.data)
     assert env._get_obs()['achieved_goal'] == pytest.approx(place[:3])
-
-
-def test_goals_are_drawn_where_the_object_was_put(make):
-    env = make('HandManipulateBlock-v1')
-    env.reset(seed=0)
-    env.data.joint('object:joint').qpos[:3] = 2.0
-    assert np.abs(env._sample_goal()[:3] - 2.0).max() < 0.5
-
-
-def test_what_is_written_into_the_model_counts(make):
-    heavy, light = make('FetchPush-v4'), make('FetchPush-v4')
-    heavy.model.body('object0').mass *= 50.0
-    twin = pickle.loads(pickle.dumps(heavy))
-    assert twin.model.body('object0').mass == heavy.model.body('object0').mass
-    moved = []
-    for env in (heavy, light, twin):
-        env.reset(seed=0)
-        env.data.joint('object0:joint').qvel[0] = 1.0
-        env.data.qfrc_applied[-6] = 5.0
-        env.step(np.zeros(4))
-        moved.append(env.data.joint('object0:joint').qvel[0])
-    assert moved[0] == moved[2]
-    assert abs(moved[0] - moved[1]) > 0.1
 
 
 def test_commands_follow_the_ranges_written_into_the_model(make):
@@ -382,39 +341,37 @@ def test_model_and_data_show_the_goal_without_a_change_of_trajectories(name, mak
     assert shown_goal(env) == pytest.approx(shown, abs=1e-12)
 
 
-def test_render_uses_the_settings_of_mujoco_renderer(make):
-    env = make('FetchReach-v4', render_mode='rgb_array')
-    env.reset(seed=0)
+def test_render_uses_the_settings_of_mujoco_renderer_and_calls_the_callback(make):
+    class Marked(FetchEnv):
+        def _render_callback(self) -> None:
+            super()._render_callback()
+            viewer = self.mujoco_renderer._get_viewer(self.render_mode)
+            viewer.add_marker(pos=self.goal, size=np.full(3, 0.5), rgba=np.array([1, 0, 0, 1]))
+
+    env, marked = make('FetchReach-v4', render_mode='rgb_array'), Marked('FetchReach')
+    marked.render_mode = 'rgb_array'
+    for each in (env, marked):
+        each.reset(seed=0)
     free = env.render()
     env.mujoco_renderer.default_cam_config = {'distance': 1.0}
     near = env.render()
     env.mujoco_renderer._get_viewer('rgb_array').cam.distance = 5.0
     far = env.render()
     env.mujoco_renderer.camera_id = 0
-    pictures = [free, near, far, env.render()]
+    pictures = [free, near, far, env.render(), marked.render()]
     env.close()
-    assert [picture.shape for picture in pictures] == [(480, 480, 3)] * 4
+    assert [picture.shape for picture in pictures] == [(480, 480, 3)] * 5
     for first, second in itertools.combinations(pictures, 2):
         assert np.abs(first.astype(float) - second).mean() > 5.0
-
-
-def test_a_picture_calls_the_render_callback(make):
-    class Marked(FetchEnv):
-        def _render_callback(self) -> None:
-            super()._render_callback()
-            viewer = self.mujoco_renderer._get_viewer(self.render_mode)
-            viewer.add_marker(pos=self.goal, size=np.full(3, 0.5), rgba=np.array([1, 0, 0, 1]))
-            self.calls = getattr(self, 'calls', 0) + 1
-
-    env = Marked('FetchReach', render_mode='rgb_array')
-    env.reset(seed=0)
-    marked = env.render()
-    assert env.calls == 1
-    red = (marked[..., 0] > 100) & (marked[..., 1:] < 50).all(axis=-1)
+    red = (pictures[4][..., 0] > 100) & (pictures[4][..., 1:] < 50).all(axis=-1)
     assert red.mean() > 0.05
 
 
-def test_depth_is_in_metres_with_either_renderer(make):
+def test_pictures_are_made_lists_of_and_depth_is_in_metres_with_either_renderer(make):
+    make('FetchReach-v4')
+    listed = gymnasium.make('FetchReach-v4', render_mode='rgb_array_list')
+    assert isinstance(listed, gymnasium.wrappers.RenderCollection)
+    assert listed.unwrapped.render_mode == 'rgb_array'
     env = make('FetchReach-v4', render_mode='depth_array')
     env.reset(seed=0)
     first = env.render()

@@ -52,9 +52,10 @@ def test_it_equals_a_dummy_vec_env_over_several_episodes(threshold):
     assert ends == 6
 
 
-def test_attributes_of_some_environments():
-    env = FetchHandVecEnv('FetchReach', 3)
-    env.reset()
+def test_attributes_and_methods_are_asked_of_some_environments():
+    env = FetchHandVecEnv('FetchReach', 3, control_hz=50.0)
+    first = env.reset()
+    assert env.metadata['render_fps'] == 50.0
     env.set_attr('goal', np.ones(3), indices=1)
     assert env.get_attr('goal', indices=[1])[0].tolist() == [1.0, 1.0, 1.0]
     assert env.get_attr('goal', indices=0)[0].tolist() != [1.0, 1.0, 1.0]
@@ -62,53 +63,52 @@ def test_attributes_of_some_environments():
     assert env.get_attr('distance_threshold') == [0.5] * 3
     with pytest.raises(ValueError, match='share reward_type'):
         env.set_attr('reward_type', 'dense', indices=[0])
-    assert env.env_is_wrapped(gymnasium.Wrapper) == [False] * 3
-    assert env.has_attr('spec_of_task')
-    assert not env.has_attr('colour')
-
-
-def test_what_concerns_all_environments_is_not_done_to_some():
-    env = FetchHandVecEnv('FetchReach', 2)
-    first = env.reset()
     with pytest.raises(ValueError, match='reset is for all environments of a batch'):
         env.env_method('reset', indices=[1])
+    assert env.env_is_wrapped(gymnasium.Wrapper) == [False] * 3
     # To ask for a method is not to call it.
-    assert all(env.has_attr(name) for name in ('reset', 'step', 'compute_reward'))
+    assert all(env.has_attr(name) for name in ('spec_of_task', 'reset', 'step'))
+    assert not env.has_attr('colour')
     (reward,) = env.get_attr('compute_reward', indices=0)
-    assert reward(first['achieved_goal'], first['achieved_goal']).tolist() == [0.0, 0.0]
-    assert np.array_equal(env.batch.simulation.observe()['desired_goal'], first['desired_goal'])
+    assert reward(first['achieved_goal'], first['achieved_goal']).tolist() == [0.0] * 3
+    assert np.array_equal(env.get_attr('goal', indices=[0]), first['desired_goal'][:1])
 
 
-def test_goals_are_asked_for_once_as_of_a_dummy_vec_env():
-    pair = (
-        FetchHandVecEnv('FetchPush', 2),
-        DummyVecEnv([lambda: gymnasium.make(environment_id('FetchPush'))] * 2),
-    )
-    goal = [1.3, 0.7, 0.5]
-    for options in ({'goal': goal}, [{}, {'goal': goal}], None):
-        for env in pair:
+def test_reset_options_count_once_as_of_a_dummy_vec_env():
+    arguments = {'disturbances': {'physics': {'friction': [0.5, 2.0]}}}
+    ours = FetchHandVecEnv('FetchPush', 2, **arguments)
+    name = environment_id('FetchPush')
+    theirs = DummyVecEnv([lambda: gymnasium.make(name, **arguments)] * 2)
+    goal, start = [1.3, 0.7, 0.5], {'object_pose': [1.25, 0.65, 0.45, 0.6, 0.0, 0.0, 0.8]}
+    variation = {'friction': 0.7}
+    for options in (
+        {'goal': goal, 'variation': variation},
+        [{}, {'goal': goal}],
+        [{'variation': variation}, {'start': start, 'goal': goal}],
+        None,
+    ):
+        for env in (ours, theirs):
             env.seed(3)
             env.set_options(options)
-        ours, theirs = (env.reset() for env in pair)
-        assert list(ours) == list(theirs)
-        for name, rows in theirs.items():
-            assert np.array_equal(ours[name], rows), name
-    ours, theirs = (env.reset() for env in pair)
-    assert np.array_equal(ours['desired_goal'], theirs['desired_goal'])
-
-
-def test_a_refused_option_is_forgotten():
-    env = FetchHandVecEnv('FetchReach', 2)
+        first, second = (env.reset() for env in (ours, theirs))
+        simulations = [each.unwrapped.simulation for each in theirs.envs]
+        assert [ours.batch.simulation.variation(i) for i in range(2)] == [
+            each.variation(0) for each in simulations
+        ]
+        assert list(first) == list(second)
+        for key, rows in second.items():
+            assert np.array_equal(first[key], rows), key
     for options, line in (
         ({'gaol': [0.0] * 3}, "has no 'gaol'; allowed: goal"),
         ([{}, {'goal': [np.nan] * 3}], 'nan'),
+        ({'variation': {'friction': 100.0}}, 'friction=100'),
     ):
-        env.set_options(options)
-        before = env.batch.simulation.task.batch.state.copy()
+        ours.set_options(options)
+        before = ours.batch.simulation.task.batch.state.copy()
         with pytest.raises(ValueError, match=line):
-            env.reset()
-        assert np.array_equal(env.batch.simulation.task.batch.state, before)
-        env.reset()
+            ours.reset()
+        assert np.array_equal(ours.batch.simulation.task.batch.state, before)
+        ours.reset()
 
 
 def test_an_episode_that_a_method_of_somebodys_own_ends_has_no_time_limit():
@@ -119,11 +119,6 @@ def test_an_episode_that_a_method_of_somebodys_own_ends_has_no_time_limit():
     assert first[2].tolist() == [True, False] and second[2].tolist() == [True, True]
     assert 'terminal_observation' in first[3][0]
     assert [info['TimeLimit.truncated'] for info in second[3]] == [False, True]
-
-
-def test_films_are_as_fast_as_the_robots():
-    for rate in (25.0, 50.0):
-        assert FetchHandVecEnv('FetchReach', control_hz=rate).metadata['render_fps'] == rate
 
 
 def test_it_learns_with_hindsight():

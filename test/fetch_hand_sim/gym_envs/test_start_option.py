@@ -57,16 +57,6 @@ def test_the_same_start_gives_the_same_bits_and_a_state_can_be_given_again(task)
         assert found[name][0, :size] == pytest.approx(readings[name][0, :size], abs=1e-12)
 
 
-def test_joints_start_where_they_were_placed_and_the_gripper_follows():
-    env = fetch_hand_sim.make('HandReach')
-    name = 'robot0:FFJ2'
-    place = env.unwrapped.spec_of_task.robot.joints.index(name)
-    drawn, _ = env.reset(seed=0)
-    placed, _ = env.reset(seed=0, options={'start': {'joints': {name: 1.2}}})
-    assert row(env, 'joint_states')[place] == 1.2
-    assert np.linalg.norm(placed['achieved_goal'] - drawn['achieved_goal']) > 0.02
-
-
 @pytest.mark.parametrize('disturbances', [None, 'hardware'])
 def test_a_batch_takes_one_start_or_a_list(disturbances):
     env = fetch_hand_sim.make_vec('FetchPush', 3, disturbances=disturbances)
@@ -85,38 +75,16 @@ def test_a_batch_takes_one_start_or_a_list(disturbances):
 
 
 def test_start_goal_and_variation_go_together():
-    env = fetch_hand_sim.make('FetchPush', disturbances={'physics': {'friction': [0.5, 2.0]}})
-    goal = [1.3, 0.8, 0.425]
-    options = {'goal': goal, 'variation': {'friction': 0.7}, 'start': {'object_pose': POSE}}
-    observation, _ = env.reset(seed=0, options=options)
-    assert observation['desired_goal'].tolist() == goal
-    assert observation['achieved_goal'] == pytest.approx(POSE[:3])
-    assert env.unwrapped.simulation.variation(0)['friction'] == 0.7
-
-
-def test_stable_baselines3_sets_all_three_for_each_environment():
-    pytest.importorskip('stable_baselines3')
-    from fetch_hand_sim.gym_envs.stable_baselines3 import FetchHandVecEnv
-
-    env = FetchHandVecEnv('FetchPush', 2, disturbances={'physics': {'friction': [0.5, 2.0]}})
-    goal = [1.3, 0.8, 0.425]
-    env.set_options(
-        [{'variation': {'friction': 0.7}}, {'start': {'object_pose': POSE}, 'goal': goal}]
-    )
-    observation = env.reset()
-    simulation = env.batch.simulation
-    assert simulation.variation(0)['friction'] == 0.7 != simulation.variation(1)['friction']
-    assert observation['achieved_goal'][1] == pytest.approx(POSE[:3])
-    assert observation['desired_goal'][1].tolist() == goal
-    env.set_options({'variation': {'friction': 1.5}})
-    env.reset()
-    assert [simulation.variation(i)['friction'] for i in range(2)] == [1.5, 1.5]
-    env.reset()
-    assert simulation.variation(0)['friction'] != 1.5, 'options count once'
-    env.set_options({'variation': {'friction': 100.0}})
-    with pytest.raises(ValueError, match='friction=100'):
-        env.reset()
-    env.reset()
+    env = fetch_hand_sim.make('HandReach', disturbances={'physics': {'gain': [0.5, 2.0]}})
+    name = 'robot0:FFJ2'
+    drawn, _ = env.reset(seed=0)
+    start = {'joints': {name: 1.2}}
+    options = {'goal': np.ones(15), 'variation': {'gain': 0.7}, 'start': start}
+    placed, _ = env.reset(seed=0, options=options)
+    assert placed['desired_goal'].tolist() == [1.0] * 15
+    assert row(env, 'joint_states')[env.unwrapped.spec_of_task.robot.joints.index(name)] == 1.2
+    assert np.linalg.norm(placed['achieved_goal'] - drawn['achieved_goal']) > 0.02
+    assert env.unwrapped.simulation.variation(0)['gain'] == 0.7
 
 
 NAMES = 'allowed: joints, joint_velocities, object_pose, object_velocity'

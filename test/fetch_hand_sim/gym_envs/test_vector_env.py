@@ -55,55 +55,76 @@ def test_the_batch_is_described_like_its_members(task):
     single = gymnasium.make(environment_id(task))
     assert env.single_observation_space == single.observation_space
     assert env.single_action_space == single.action_space
-    assert env.metadata['autoreset_mode'] is AutoresetMode.NEXT_STEP
     observation, _ = env.reset(seed=0)
     assert env.observation_space.contains(observation)
     assert list(observation) == list(env.observation_space)
 
 
-@pytest.mark.parametrize('mode', [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
-@pytest.mark.parametrize('task', ['FetchPush', 'HandReach', 'HandManipulateBlockRotateParallel'])
-def test_it_equals_gymnasiums_vectorisation_over_several_episodes(task, mode):
-    env = make_vec(task, 3, max_episode_steps=4, reward_type='dense', autoreset_mode=mode)
-    reference = members(task, 3, mode, max_episode_steps=4, reward_type='dense')
-    assert_same(env.reset(seed=11)[0], reference.reset(seed=11)[0])
+def assert_same_steps(env, reference, count: int) -> np.ndarray:
+    """Play both; return how often each environment terminated and was truncated, (2, N)."""
     env.action_space.seed(0)
-    ends = 0
-    for _ in range(13):
+    ends = np.zeros((2, env.num_envs))
+    for _ in range(count):
         actions = env.action_space.sample()
         ours, theirs = env.step(actions), reference.step(actions)
         assert list(ours[0]) == list(theirs[0])
         for mine, other in zip(ours[:4], theirs[:4], strict=True):
             assert_same(mine, other)
-        assert_same(ours[4]['is_success'], theirs[4].get('is_success', np.zeros(3)))
-        assert_same(ours[4]['_is_success'], theirs[4].get('_is_success', np.zeros(3, dtype=bool)))
         assert ('final_obs' in ours[4]) == ('final_obs' in theirs[4])
-        if 'final_obs' in ours[4]:
-            assert_same(ours[4]['_final_obs'], theirs[4]['_final_obs'])
-            assert_same(ours[4]['final_info'], theirs[4]['final_info'])
-            for mine, other in zip(ours[4]['final_obs'], theirs[4]['final_obs'], strict=True):
-                assert_same(mine, other)
-        ends += ours[3].all()
-    assert ends == (2 if mode is AutoresetMode.NEXT_STEP else 3)
+        for name in theirs[4].keys() - {'final_obs'}:
+            assert_same(ours[4][name], theirs[4][name])
+        finals = (info.get('final_obs', ()) for info in (ours[4], theirs[4]))
+        for mine, other in zip(*finals, strict=True):
+            assert_same(mine, other)
+        ends += ours[2:4]
+    return ends
 
 
-@pytest.mark.parametrize('mode', [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
-def test_successes_count_for_those_only_that_the_masks_name(mode):
+class Reaching:
+    """Ends episodes at the goal, and those whose goal lies to the right."""
+
+    def compute_terminated(self, achieved_goal, desired_goal, info):
+        return info['is_success'] > 0.0
+
+    def compute_truncated(self, achieved_goal, desired_goal, info):
+        return desired_goal[..., 1] < 0.75
+
+
+every_mode = pytest.mark.parametrize('mode', [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
+
+
+@every_mode
+@pytest.mark.parametrize('task', ['FetchPush', 'HandReach', 'HandManipulateBlockRotateParallel'])
+def test_it_equals_gymnasiums_vectorisation_over_several_episodes(task, mode):
+    arguments = {'max_episode_steps': 4, 'reward_type': 'dense'}
+    pair = make_vec(task, 3, autoreset_mode=mode, **arguments), members(task, 3, mode, **arguments)
+    assert pair[0].metadata['autoreset_mode'] is mode
+    assert_same(*(env.reset(seed=11)[0] for env in pair))
+    ends = assert_same_steps(*pair, 13)
+    assert ends.tolist() == [[0] * 3, [2 if mode is AutoresetMode.NEXT_STEP else 3] * 3]
+
+
+@every_mode
+def test_successes_and_endings_of_a_subclass_count_as_in_gymnasiums_vectorisation(mode):
     arguments = {'max_episode_steps': 3, 'distance_threshold': 10.0}
     pair = (
         make_vec('FetchReach', 2, autoreset_mode=mode, **arguments),
         members('FetchReach', 2, mode, **arguments),
     )
-    actions = np.zeros((2, 4), dtype=np.float32)
     for env in pair:
         env.reset(seed=0)
-        env.step(actions)
+        env.step(np.zeros((2, 4), np.float32))
         env.reset(options={'reset_mask': np.array([True, False])})
-    for _ in range(4):
-        mine, other = (env.step(actions)[4] for env in pair)
-        assert mine.keys() == other.keys()
-        for name in mine.keys() - {'final_obs'}:
-            assert_same(mine[name], other[name])
+    assert_same_steps(*pair, 4)
+    arguments = {'task': 'FetchReach', 'distance_threshold': 0.12}
+    batch, single = (type('Own', (Reaching, b), {}) for b in (FetchHandVectorEnv, FetchHandEnv))
+    pair = (
+        batch(num_envs=6, autoreset_mode=mode, **arguments),
+        gymnasium.vector.SyncVectorEnv([lambda: single(**arguments)] * 6, autoreset_mode=mode),
+    )
+    assert_same(*(env.reset(seed=1)[0] for env in pair))
+    ends = assert_same_steps(*pair, 8)
+    assert ends.any(axis=1).all() and not ends.all()
 
 
 def test_actions_of_those_who_only_begin_count_for_nothing():
@@ -111,9 +132,10 @@ def test_actions_of_those_who_only_begin_count_for_nothing():
     env.reset(seed=0)
     for _ in range(3):
         env.step(np.zeros((2, 4), np.float32))
-    twin = copy.deepcopy(env)
-    first = env.step(np.full((2, 4), np.nan, np.float32))
-    assert_same(first[0], twin.step(np.ones((2, 4), np.float32))[0])
+    for twin in (copy.deepcopy(env), pickle.loads(pickle.dumps(env))):
+        first = copy.deepcopy(env).step(np.full((2, 4), np.nan, np.float32))
+        assert_same(first[0], twin.step(np.ones((2, 4), np.float32))[0])
+    env.step(np.zeros((2, 4), np.float32))
     with pytest.raises(ValueError, match='is nan'):
         env.step(np.full((2, 4), np.nan, np.float32))
 
@@ -131,12 +153,6 @@ def test_what_is_lost_after_its_episode_ended_draws_nothing():
     assert lost[3].tolist() == other[3].tolist() == [False, False]
 
 
-def test_nothing_is_drawn_before_the_first_reset():
-    env = make_vec('FetchReach', 2, render_mode='rgb_array')
-    with pytest.raises(gymnasium.error.ResetNeeded, match='before render'):
-        env.render()
-
-
 def test_without_autoreset_an_ended_episode_waits_for_its_reset():
     env = make_vec('FetchReach', 2, max_episode_steps=2, autoreset_mode='Disabled')
     env.reset(seed=0)
@@ -149,37 +165,6 @@ def test_without_autoreset_an_ended_episode_waits_for_its_reset():
     assert state_of(env) == before
     env.reset(options={'reset_mask': np.array([True, False])})
     assert env.step(env.action_space.sample())[3].tolist() == [False, True]
-
-
-class Reaching:
-    """Ends episodes at the goal, and those whose goal lies to the right."""
-
-    def compute_terminated(self, achieved_goal, desired_goal, info):
-        return info['is_success'] > 0.0
-
-    def compute_truncated(self, achieved_goal, desired_goal, info):
-        return desired_goal[..., 1] < 0.75
-
-
-@pytest.mark.parametrize('mode', [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
-def test_endings_of_a_subclass_count_as_in_gymnasiums_vectorisation(mode):
-    arguments = {'task': 'FetchReach', 'distance_threshold': 0.12}
-    env = type('Batch', (Reaching, FetchHandVectorEnv), {})(
-        num_envs=6, autoreset_mode=mode, **arguments
-    )
-    single = type('Single', (Reaching, FetchHandEnv), {})
-    reference = gymnasium.vector.SyncVectorEnv(
-        [lambda: single(**arguments)] * 6, autoreset_mode=mode
-    )
-    assert_same(env.reset(seed=1)[0], reference.reset(seed=1)[0])
-    ends = np.zeros((2, 6))
-    for _ in range(8):
-        actions = env.action_space.sample()
-        ours, theirs = env.step(actions), reference.step(actions)
-        for mine, other in zip(ours[:4], theirs[:4], strict=True):
-            assert_same(mine, other)
-        ends += ours[2:4]
-    assert ends.any(axis=1).all() and not ends.all()
 
 
 def test_what_a_batch_does_not_ask_is_refused():
@@ -228,17 +213,6 @@ def test_attributes_and_calls_are_those_of_the_members():
         env.get_attr('colour')
 
 
-def test_a_copy_goes_on_to_the_same_bits():
-    env = make_vec('HandManipulateEggRotate', 3, max_episode_steps=4).unwrapped
-    env.reset(seed=0)
-    env.step(env.action_space.sample())
-    twin = pickle.loads(pickle.dumps(env))
-    for _ in range(5):
-        actions = env.action_space.sample()
-        for mine, other in zip(env.step(actions)[:4], twin.step(actions)[:4], strict=True):
-            assert_same(mine, other)
-
-
 @pytest.mark.parametrize('kind', [FetchHandEnv, FetchHandVectorEnv])
 def test_a_shallow_copy_has_no_physics_in_common(kind):
     env = kind('FetchPush')
@@ -248,20 +222,6 @@ def test_a_shallow_copy_has_no_physics_in_common(kind):
     twin.step(np.ones(env.action_space.shape, np.float32))
     twin.reset()
     assert state_of(env) == before != state_of(twin)
-
-
-def test_pictures_show_each_environment(monkeypatch):
-    monkeypatch.setenv('MUJOCO_GL', 'egl')
-    env = make_vec('FetchReach', 2, render_mode='rgb_array', width=96, height=64)
-    env.reset(seed=0)
-    try:
-        pictures = env.render()
-    except RuntimeError as error:
-        pytest.skip(str(error))
-    assert [picture.shape for picture in pictures] == [(64, 96, 3)] * 2
-    # The goals differ.
-    assert (pictures[0] != pictures[1]).any()
-    assert make_vec('FetchReach', 1).render() is None
 
 
 def test_a_masked_reset_starts_only_the_masked():
@@ -299,89 +259,6 @@ def test_episodes_have_the_goals_that_their_reset_was_given():
     with pytest.raises(ValueError, match=r'shape \(2, 3\) given; .* \(3,\) or \(3, 3\)'):
         env.reset(options={'reset_mask': mask, 'goal': goals[1:]})
     assert state_of(env) == before
-
-
-def test_seeds_are_told_as_gymnasiums_vectorisation_tells_them():
-    env = make_vec('FetchReach', 3)
-    reference = members('FetchReach', 3)
-    one = np.array([False, True, False])
-    for arguments, expected in (
-        ({'seed': 5}, (5, 6, 7)),
-        ({}, (5, 6, 7)),
-        ({'seed': [3, None, 9]}, (3, 6, 9)),
-        ({'seed': 20, 'options': {'reset_mask': one}}, (3, 21, 9)),
-        ({'seed': [1, 2, 4], 'options': {'reset_mask': one}}, (3, 2, 9)),
-    ):
-        for each in (env, reference):
-            # Gymnasium takes the mask out of the dictionary.
-            each.reset(**copy.deepcopy(arguments))
-            assert each.np_random_seed == each.unwrapped.get_attr('np_random_seed') == expected
-
-
-def test_random_generators_are_those_that_are_drawn_from():
-    env = make_vec('FetchReach', 2)
-    reference = members('FetchReach', 2)
-    for each in (env, reference):
-        each.reset(seed=5)
-    for mine, other in zip(env.np_random, reference.np_random, strict=True):
-        assert mine.bit_generator.state == other.bit_generator.state
-    kept = [each.bit_generator.state for each in env.get_attr('np_random')]
-    first, _ = env.reset()
-    for generator, state in zip(env.np_random, kept, strict=True):
-        generator.bit_generator.state = state
-    assert_same(env.reset()[0], first)
-
-
-def test_a_seed_that_nobody_gave_is_told_too():
-    env = make_vec('FetchReach', 2)
-    assert env.np_random_seed == (-1, -1)
-    first, _ = env.reset()
-    assert min(env.np_random_seed) >= 0
-    assert_same(make_vec('FetchReach', 2).reset(seed=env.np_random_seed)[0], first)
-
-
-def test_generators_that_somebody_holds_before_the_first_episode_are_drawn_from():
-    env = make_vec('FetchReach', 2)
-    held = env.np_random
-    for number, generator in enumerate(held):
-        generator.bit_generator.state = np.random.default_rng(number).bit_generator.state
-    first, _ = env.reset()
-    assert all(mine is other for mine, other in zip(env.np_random, held, strict=True))
-    for number, generator in enumerate(env.np_random):
-        generator.bit_generator.state = np.random.default_rng(number).bit_generator.state
-    assert_same(env.reset()[0], first)
-    untouched = make_vec('FetchReach', 2)
-    assert len(untouched.np_random) == 2
-    first, _ = untouched.reset()
-    assert_same(make_vec('FetchReach', 2).reset(seed=untouched.np_random_seed)[0], first)
-
-
-def test_a_diverged_environment_is_truncated_and_starts_again():
-    env = make_vec('FetchPush', 3)
-    env.reset(seed=0)
-    env.unwrapped.simulation.task.batch.bind('qvel')[1, 0] = np.nan
-    _, _, terminated, truncated, info = env.step(np.zeros((3, 4)))
-    assert truncated.tolist() == info['diverged'].tolist() == [False, True, False]
-    assert not terminated.any()
-    _, reward, _, truncated, info = env.step(np.zeros((3, 4)))
-    assert not truncated.any()
-    assert reward[1] == 0.0
-    assert info['_is_success'].tolist() == [True, False, True]
-
-
-def test_what_was_lost_can_be_asked_of_one_step_and_of_many():
-    env = make_vec('FetchPush', 3)
-    observation, _ = env.reset(seed=0)
-    env.unwrapped.simulation.task.batch.bind('qvel')[1, 0] = np.nan
-    truncated, info = env.step(np.zeros((3, 4)))[3:]
-    goals = observation['achieved_goal'], observation['desired_goal']
-    lost = env.unwrapped.compute_truncated
-    assert lost(*goals, info).tolist() == truncated.tolist()
-    infos = [{'diverged': each} for each in truncated]
-    # A list, and an array of objects as replay buffers keep them.
-    for many in (infos, np.array(infos)):
-        assert lost(*goals, many).tolist() == truncated.tolist()
-    assert [lost(*goals, one) for one in ({}, None, infos[1])] == [False, False, True]
 
 
 BAD_RESETS = {
@@ -428,6 +305,80 @@ def test_actions_that_are_infinite_are_clipped():
     assert_same(first.step(far)[0], second.step(np.clip(far, -1.0, 1.0))[0])
 
 
+def test_seeds_and_generators_are_those_of_gymnasiums_vectorisation():
+    env, reference = make_vec('FetchReach', 3), members('FetchReach', 3)
+    one = np.array([False, True, False])
+    for arguments, expected in (
+        ({'seed': 5}, (5, 6, 7)),
+        ({}, (5, 6, 7)),
+        ({'seed': [3, None, 9]}, (3, 6, 9)),
+        ({'seed': 20, 'options': {'reset_mask': one}}, (3, 21, 9)),
+        ({'seed': [1, 2, 4], 'options': {'reset_mask': one}}, (3, 2, 9)),
+    ):
+        for each in (env, reference):
+            # Gymnasium takes the mask out of the dictionary.
+            each.reset(**copy.deepcopy(arguments))
+            assert each.np_random_seed == each.unwrapped.get_attr('np_random_seed') == expected
+    for mine, other in zip(env.np_random, reference.np_random, strict=True):
+        assert mine.bit_generator.state == other.bit_generator.state
+
+
+def test_generators_may_be_read_and_written_before_the_first_episode():
+    drawn, read, held = (make_vec('FetchReach', 2) for _ in range(3))
+    assert drawn.np_random_seed == (-1, -1)
+    assert min(generator.bit_generator.state['state']['state'] for generator in read.np_random) > 0
+    for env in (drawn, read):
+        first, _ = env.reset()
+        assert min(env.np_random_seed) >= 0
+        assert_same(make_vec('FetchReach', 2).reset(seed=env.np_random_seed)[0], first)
+    generators, goals = held.get_attr('np_random'), []
+    for _ in range(2):
+        for number, generator in enumerate(held.np_random):
+            generator.bit_generator.state = np.random.default_rng(number).bit_generator.state
+        goals.append(held.reset()[0])
+    assert all(mine is other for mine, other in zip(held.np_random, generators, strict=True))
+    assert_same(*goals)
+
+
+def test_a_diverged_environment_is_truncated_and_starts_again():
+    env = make_vec('FetchPush', 3, render_mode='rgb_array')
+    mask = np.array([False, True, False])
+    with pytest.raises(gymnasium.error.ResetNeeded, match=r'reset_mask leaves out \[0, 2\]'):
+        env.reset(options={'reset_mask': mask})
+    with pytest.raises(gymnasium.error.ResetNeeded, match='before render'):
+        env.render()
+    observation, _ = env.reset(seed=0)
+    env.unwrapped.simulation.task.batch.bind('qvel')[1, 0] = np.nan
+    _, _, terminated, truncated, info = env.step(np.zeros((3, 4)))
+    assert truncated.tolist() == info['diverged'].tolist() == [False, True, False]
+    assert not terminated.any()
+    # Replay buffers ask again: with the info of one step or a list of many.
+    goals = observation['achieved_goal'], observation['desired_goal']
+    infos = [{'diverged': each} for each in truncated]
+    for many in (info, infos, np.array(infos)):
+        assert env.unwrapped.compute_truncated(*goals, many).tolist() == truncated.tolist()
+    lost = [env.unwrapped.compute_truncated(*goals, one) for one in ({}, None, infos[1])]
+    assert lost == [False, False, True]
+    _, reward, _, truncated, info = env.step(np.zeros((3, 4)))
+    assert not truncated.any()
+    assert reward[1] == 0.0
+    assert info['_is_success'].tolist() == [True, False, True]
+
+
+def test_pictures_show_each_environment(monkeypatch):
+    monkeypatch.setenv('MUJOCO_GL', 'egl')
+    env = make_vec('FetchReach', 2, render_mode='rgb_array', width=96, height=64)
+    env.reset(seed=0)
+    try:
+        pictures = env.render()
+    except RuntimeError as error:
+        pytest.skip(str(error))
+    assert [picture.shape for picture in pictures] == [(64, 96, 3)] * 2
+    # The goals differ.
+    assert (pictures[0] != pictures[1]).any()
+    assert make_vec('FetchReach', 1).render() is None
+
+
 def test_arguments_of_gymnasium_are_those_of_its_vectorisation():
     env = make_vec('FetchReach', 2, max_episode_steps=-1, disable_env_checker=True)
     env.reset(seed=0)
@@ -437,15 +388,6 @@ def test_arguments_of_gymnasium_are_those_of_its_vectorisation():
     assert fetch_hand_sim.make_vec('FetchReach', vectorization_mode='vector_entry_point')
     with pytest.raises(ValueError, match="mode 'sync' is for gymnasium"):
         fetch_hand_sim.make_vec('FetchReach', 2, vectorization_mode='sync')
-
-
-def test_the_first_reset_is_one_of_all():
-    env = make_vec('FetchReach', 3)
-    mask = np.array([False, True, False])
-    with pytest.raises(gymnasium.error.ResetNeeded, match=r'reset_mask leaves out \[0, 2\]'):
-        env.reset(options={'reset_mask': mask})
-    env.reset(seed=0)
-    env.reset(options={'reset_mask': mask})
 
 
 @pytest.mark.parametrize(
