@@ -5,6 +5,8 @@ Settings are those of the `best` recipe, or of another named one, except for the
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from itertools import product
 from typing import Any
 
 from msgs_spec.tasks import TASKS
@@ -38,7 +40,9 @@ _SKILLED_PUSH = {
 }
 _SLIDE = {**_LONG, 'total_steps': 2_000_000, 'evaluate_every': 64_000}
 HAND: dict[str, Any] = {**_LONG, 'total_steps': 1_000_000, 'evaluate_every': 64_000}
-_SCREENED = {'evaluate_every': 64_000, 'evaluation_episodes': 128}
+_SCREENED = {'total_steps': 400_000, 'evaluate_every': 64_000, 'evaluation_episodes': 128}
+# Imagined subgoals, learnt every fourth time.
+_RARE_PRIOR: dict[str, Any] = {'subgoal_prior': 0.3, 'imagination_interval': 4}
 # Sparse rewards; the recipe of the task has dense ones.
 _SPARSE_HAND_REACH = {
     **_LONG,
@@ -79,130 +83,8 @@ _ON_POLICY_PUSH = {
 }
 
 
-def _arms(field: str, **labels: str) -> tuple[Arm, ...]:
-    """Return a variant for each value of one field."""
-    return tuple(Arm(name, label, {field: name}) for name, label in labels.items())
-
-
-def _targets() -> tuple[Arm, ...]:
-    """Return targets at four intervals, and no targets with three normalisations."""
-    slow = [
-        Arm(
-            f'polyak{interval}',
-            f'target moves every {interval} updates',
-            {'target': 'polyak', 'target_update_interval': interval},
-        )
-        for interval in (10, 1, 4, 40)
-    ]
-    none = [
-        Arm(f'none_{norm}', f'no target network, norm {norm}', {'target': 'none', 'norm': norm})
-        for norm in ('none', 'layer', 'batch')
-    ]
-    layer = Arm(
-        'polyak10_layer',
-        'target moves every 10 updates, norm layer',
-        {'target': 'polyak', 'target_update_interval': 10, 'norm': 'layer'},
-    )
-    return (*slow, layer, *none)
-
-
-def _returns() -> tuple[Arm, ...]:
-    """Return one step, and longer returns with each correction."""
-    longer = [
-        Arm(
-            f'{correction}{steps}',
-            f'{steps} steps, correction {correction}',
-            {'n_step': steps, 'correction': correction},
-        )
-        for steps in (3, 5, 10)
-        for correction in ('none', 'lambda', 'cut')
-    ]
-    return (Arm('one', 'one step', {'n_step': 1}), *longer)
-
-
-def _rates() -> tuple[Arm, ...]:
-    """Return the recipe at 250, 125 and 25 Hz, and remedies at 250 Hz."""
-    helps: dict[str, tuple[str, dict[str, Any]]] = {
-        'discount': ('discount per 40 ms', {'discount': 'time'}),
-        'noise': ('noise held for 40 ms', {'noise_seconds': 0.04}),
-        'both': ('both', {'discount': 'time', 'noise_seconds': 0.04}),
-        'steps': ('returns of 10 steps', {'n_step': 10}),
-        'discount_steps': (
-            'discount per 40 ms, returns of 10 steps',
-            {'discount': 'time', 'n_step': 10},
-        ),
-        'noise_steps': (
-            'noise held for 40 ms, returns of 10 steps',
-            {'noise_seconds': 0.04, 'n_step': 10},
-        ),
-        'three': (
-            'all three',
-            {'discount': 'time', 'noise_seconds': 0.04, 'n_step': 10},
-        ),
-        'parameters': ('noise on weights', {'parameter_noise': True}),
-        'skip': ('learned frame skip, up to 80 ms', {'longest_hold': 20}),
-        'skip_discount': (
-            'learned frame skip, discount per 40 ms',
-            {'longest_hold': 20, 'discount': 'time'},
-        ),
-        'advantage': (
-            'advantages (DAU), discount per 40 ms, noise held',
-            {'advantage': True, 'discount': 'time', 'noise_seconds': 0.04},
-        ),
-    }
-    plain = [
-        Arm(
-            f'plain{rate}',
-            f'{rate} Hz, as it is',
-            {'control_hz': float(rate), 'discount': 'tick'},
-        )
-        for rate in (250, 125, 25)
-    ]
-    arms = [
-        Arm(name, f'250 Hz, {label}', {'control_hz': 250.0, **changes})
-        for name, (label, changes) in helps.items()
-    ]
-    return (*plain, *arms)
-
-
-def _ensembles() -> tuple[Arm, ...]:
-    """Return one critic, several with each aggregation, quantiles, and more updates per step."""
-    several = [
-        Arm(
-            f'{aggregate}{critics}',
-            f'{critics} critics, {aggregate}',
-            {'critics': critics, 'aggregate': aggregate},
-        )
-        for critics, aggregate in (
-            (2, 'mean'),
-            (2, 'min'),
-            (5, 'mean'),
-            (5, 'min'),
-            (5, 'truncated'),
-        )
-    ]
-    quantiles = [
-        Arm('quantiles', 'one critic of 25 quantiles', {'quantiles': 25}),
-        Arm(
-            'tqc2',
-            '2 critics of 25 quantiles, truncated (TQC)',
-            {'critics': 2, 'quantiles': 25, 'aggregate': 'truncated'},
-        ),
-    ]
-    more = [
-        Arm(f'updates{times}', f'{times} times the updates', factors={'updates_per_cycle': times})
-        for times in (2, 4)
-    ]
-    # With more updates, targets also move faster.
-    slow = Arm(
-        'updates4_slow',
-        '4 times the updates, targets as slow as before',
-        factors={'updates_per_cycle': 4, 'target_update_interval': 4},
-    )
-    return (Arm('one', 'one critic', {'critics': 1}), *several, *quantiles, *more, slow)
-
-
-_NO_HINDSIGHT = {'strategy': 'none', 'goals': ''}
+def _arm(name: str, label: str, **changes: Any) -> Arm:
+    return Arm(name, label, changes)
 
 
 def _paper_settings(task: str) -> dict[str, Any]:
@@ -230,210 +112,241 @@ def _paper_settings(task: str) -> dict[str, Any]:
     return {**scaled, **steps, 'batch_size': 1024, 'precision': 'bfloat16'}
 
 
-PAPER = Study(
-    'paper',
-    None,
-    'What do hindsight and dense rewards do to DDPG, on every task of the paper?',
-    {task: _paper_settings(task) for task in TASKS},
-    (
-        Arm('her_sparse', 'DDPG+HER, sparse', {'reward_type': 'sparse'}),
-        Arm('her_dense', 'DDPG+HER, dense', {'reward_type': 'dense'}),
-        Arm('ddpg_sparse', 'DDPG, sparse', {'reward_type': 'sparse', **_NO_HINDSIGHT}),
-        Arm('ddpg_dense', 'DDPG, dense', {'reward_type': 'dense', **_NO_HINDSIGHT}),
-    ),
-)
-"""The paper's comparison, the four curves in each panel of its figures."""
+def _returns() -> Iterator[Arm]:
+    """Yield one step, and longer returns with each correction."""
+    yield _arm('one', 'one step', n_step=1)
+    for steps, correction in product((3, 5, 10), ('none', 'lambda', 'cut')):
+        label = f'{steps} steps, correction {correction}'
+        yield _arm(f'{correction}{steps}', label, n_step=steps, correction=correction)
 
-STUDIES: dict[str, Study] = {
-    study.name: study
-    for study in (
-        PAPER,
-        Study(
-            'goals',
-            1,
-            'Are goals worth more that the critic errs on, or that critics differ in?',
-            {
-                'FetchReach': _REACH,
-                'FetchPush': {**_LONG, 'total_steps': 600_000},
-                'FetchPickAndPlace': _PICK,
-            },
-            (
-                Arm('uniform', 'any future goal', {'goal_choice': 'uniform', 'critics': 2}),
-                Arm('bellman', 'greatest error of 8', {'goal_choice': 'bellman', 'critics': 2}),
-                Arm('uncertain', 'widest gap of 8', {'goal_choice': 'uncertain', 'critics': 2}),
-            ),
-        ),
-        Study(
-            'unbiased',
-            2,
-            'Does hindsight take a gamble for a sure thing, and what cures it?',
-            {
-                'FetchReach': {**_REACH, 'gamble': True},
-                'FetchPush': {**_SKILLED_PUSH, 'gamble': True},
-            },
-            (
-                Arm('future', 'future goals', {'strategy': 'future'}),
-                Arm(
-                    'weighted',
-                    'half future, half actual, importance weights',
-                    {'goals': 'future=.4,actual=.4', 'importance': 'density'},
-                ),
-                Arm('actual', 'desired goals of any episode', {'goals': 'actual=.8'}),
-                Arm('random', 'achieved goals of any episode', {'goals': 'random=.8'}),
-                Arm('mixed', 'half future, half actual', {'goals': 'future=.4,actual=.4'}),
-                Arm(
-                    'displaced',
-                    'half actual, half displaced',
-                    {'goals': 'actual=.4,displaced=.4'},
-                ),
-                Arm('none', 'no hindsight', {'strategy': 'none'}),
-            ),
-        ),
-        Study(
-            'hierarchy',
-            3,
-            'Do subgoals get the actor to its goals in fewer steps?',
-            {
-                'FetchPickAndPlace': _PICK,
-                'HandManipulateBlockRotateXYZ': HAND,
-                'FetchReach': _REACH,
-                'FetchPush': _PUSH,
-                'FetchSlide': _SLIDE,
-            },
-            (
-                Arm('flat', 'no subgoals', {'subgoal_every': 0}),
-                Arm('every10', 'a subgoal every 10 ticks', {'subgoal_every': 10}),
-                Arm('prior', 'imagined subgoals, weight .3', {'subgoal_prior': 0.3}),
-                Arm(
-                    'prior4',
-                    'the same, imagination learnt every 4th time',
-                    {'subgoal_prior': 0.3, 'imagination_interval': 4},
-                ),
-            ),
-        ),
-        Study(
-            'values',
-            4,
-            'Do values of more than a goal help: of how close, or of how soon?',
-            {'HandReach': _SPARSE_HAND_REACH, 'FetchReach': _REACH},
-            (
-                *_arms(
-                    'condition',
-                    none='the goal alone',
-                    threshold='and the success threshold',
-                    horizon='and the steps left',
-                ),
-                Arm(
-                    'threshold32',
-                    'and the success threshold, four times as wide',
-                    {'condition': 'threshold', 'widest_threshold': 32.0},
-                ),
-                # The thresholds without the input.
-                Arm(
-                    'graded',
-                    'the goal alone, graded rewards',
-                    {'reward_grades': '.5,1,2,4,8,16,32'},
-                ),
-            ),
-        ),
-        Study(
-            'targets',
-            5,
-            'Can targets move faster, or be left out?',
-            {'FetchReach': _REACH, 'FetchPush': _PUSH, 'FetchPickAndPlace': _PICK},
-            _targets(),
-        ),
-        Study(
-            'returns',
-            6,
-            'Do returns of several steps help data that is far from the policy?',
-            {'FetchReach': _REACH, 'FetchPush': _PUSH, 'FetchSlide': _SLIDE},
-            _returns(),
-        ),
-        Study(
-            'onpolicy',
-            7,
-            'Can an on-policy method use goals in hindsight?',
-            {
-                'FetchReach': {
-                    **_REACH,
-                    **_ON_POLICY,
-                    'total_steps': 96_000,
-                    'evaluate_every': 9_600,
-                },
-                'FetchPush': {**_LONG, **_ON_POLICY_PUSH, 'total_steps': 1_000_000},
-            },
-            (
-                Arm('none', 'no hindsight', {'strategy': 'none'}),
-                Arm('taken', 'goals in hindsight, as if acted for', {'strategy': 'future'}),
-                Arm(
-                    'weighed',
-                    'goals in hindsight, weighed per decision',
-                    {'strategy': 'future', 'importance': 'decision'},
-                ),
-                Arm(
-                    'moved',
-                    'as if acted for, 4 of 5 from episodes that moved something',
-                    {'strategy': 'future', 'moved_share': 0.8},
-                ),
-                Arm('outcome', 'what other episodes brought about', {'goals': 'outcome=.9'}),
-            ),
-        ),
-        Study(
-            'ensembles',
-            8,
-            'Do several critics help, for the time that they cost?',
-            {
-                'FetchReach': _REACH,
-                'FetchPickAndPlace': _PICK,
-                'HandManipulateBlockRotateZ': HAND,
-            },
-            _ensembles(),
-        ),
-        Study(
-            'rates',
-            9,
-            'What keeps learning alive where actions are very frequent?',
-            {
-                'FetchReach': {**_REACH, 'evaluation_episodes': 16},
-                # A replay for all ticks of a run at 250 Hz.
-                'FetchPush': {**_LONG, 'total_steps': 600_000, 'replay_transitions': 6_000_000},
-            },
-            _rates(),
-        ),
-        Study(
-            'ingredients',
-            None,
-            'What does each part of the recipe for the hand buy?',
-            {
-                'HandManipulateEggRotate': {**_SCREENED, 'total_steps': 400_000},
-                'HandManipulateBlockRotateXYZ': {**_SCREENED, 'total_steps': 400_000},
-            },
-            (
-                Arm('best', 'the recipe'),
-                Arm('plain', 'plain features', {'goal_features': 'plain'}),
-                Arm('few', '13 samples per step, not 51', {'batch_size': 256}),
-                Arm('future', 'future goals alone', {'strategy': 'future'}),
-                Arm('graded', 'graded rewards', {'reward_grades': '.5,1,2'}),
-                Arm(
-                    'displaced',
-                    'half as many future goals, displaced ones instead',
-                    {'goals': 'future=.2,actual=.2,displaced=.4'},
-                ),
-                Arm(
-                    'unbiased',
-                    'displaced goals, no future ones',
-                    {'goals': 'actual=.4,displaced=.4'},
-                ),
-                Arm('discount', 'discount 0.95, not 0.98', {'gamma': 0.95}),
-                Arm(
-                    'prior4',
-                    'imagined subgoals',
-                    {'subgoal_prior': 0.3, 'imagination_interval': 4},
-                ),
-                Arm('returns', 'returns of five steps', {'n_step': 5}),
-            ),
-            seeds=2,
+
+def _targets() -> Iterator[Arm]:
+    """Yield targets at four intervals, and no targets with three normalisations."""
+    slow: dict[str, Any] = {'target': 'polyak', 'target_update_interval': 10}
+    for updates in (10, 1, 4, 40):
+        label = f'target moves every {updates} updates'
+        yield _arm(f'polyak{updates}', label, **slow | {'target_update_interval': updates})
+    yield _arm('polyak10_layer', 'target moves every 10 updates, norm layer', **slow, norm='layer')
+    for norm in ('none', 'layer', 'batch'):
+        yield _arm(f'none_{norm}', f'no target network, norm {norm}', target='none', norm=norm)
+
+
+def _ensembles() -> Iterator[Arm]:
+    """Yield one critic, several with each aggregation, quantiles, and more updates per step."""
+    yield _arm('one', 'one critic', critics=1)
+    for number, pooling in ((2, 'mean'), (2, 'min'), (5, 'mean'), (5, 'min'), (5, 'truncated')):
+        label = f'{number} critics, {pooling}'
+        yield _arm(f'{pooling}{number}', label, critics=number, aggregate=pooling)
+    yield _arm('quantiles', 'one critic of 25 quantiles', quantiles=25)
+    tqc = {'critics': 2, 'quantiles': 25, 'aggregate': 'truncated'}
+    yield _arm('tqc2', '2 critics of 25 quantiles, truncated (TQC)', **tqc)
+    for times in (2, 4):
+        more = {'updates_per_cycle': times}
+        yield Arm(f'updates{times}', f'{times} times the updates', factors=more)
+    # With more updates, targets also move faster.
+    more = {'updates_per_cycle': 4, 'target_update_interval': 4}
+    yield Arm('updates4_slow', '4 times the updates, targets as slow as before', factors=more)
+
+
+def _rates() -> Iterator[Arm]:
+    """Yield the recipe at 250, 125 and 25 Hz, and remedies at 250 Hz."""
+    for rate in (250, 125, 25):
+        label = f'{rate} Hz, as it is'
+        yield _arm(f'plain{rate}', label, control_hz=float(rate), discount='tick')
+    discount: dict[str, Any] = {'discount': 'time'}
+    noise: dict[str, Any] = {'noise_seconds': 0.04}
+    steps: dict[str, Any] = {'n_step': 10}
+    skip: dict[str, Any] = {'longest_hold': 20}
+    remedies: tuple[tuple[str, str, dict[str, Any]], ...] = (
+        ('discount', 'discount per 40 ms', discount),
+        ('noise', 'noise held for 40 ms', noise),
+        ('both', 'both', discount | noise),
+        ('steps', 'returns of 10 steps', steps),
+        ('discount_steps', 'discount per 40 ms, returns of 10 steps', discount | steps),
+        ('noise_steps', 'noise held for 40 ms, returns of 10 steps', noise | steps),
+        ('three', 'all three', discount | noise | steps),
+        ('parameters', 'noise on weights', {'parameter_noise': True}),
+        ('skip', 'learned frame skip, up to 80 ms', skip),
+        ('skip_discount', 'learned frame skip, discount per 40 ms', skip | discount),
+        (
+            'advantage',
+            'advantages (DAU), discount per 40 ms, noise held',
+            {'advantage': True} | discount | noise,
         ),
     )
-}
+    for name, label, changes in remedies:
+        yield _arm(name, f'250 Hz, {label}', control_hz=250.0, **changes)
+
+
+_NO_HINDSIGHT = {'strategy': 'none', 'goals': ''}
+_HALF = 'future=.4,actual=.4'
+
+_ALL = (
+    # The paper's comparison, the four curves in each panel of its figures.
+    Study(
+        'paper',
+        None,
+        'What do hindsight and dense rewards do to DDPG, on every task of the paper?',
+        {task: _paper_settings(task) for task in TASKS},
+        (
+            _arm('her_sparse', 'DDPG+HER, sparse', reward_type='sparse'),
+            _arm('her_dense', 'DDPG+HER, dense', reward_type='dense'),
+            _arm('ddpg_sparse', 'DDPG, sparse', reward_type='sparse', **_NO_HINDSIGHT),
+            _arm('ddpg_dense', 'DDPG, dense', reward_type='dense', **_NO_HINDSIGHT),
+        ),
+    ),
+    Study(
+        'goals',
+        1,
+        'Are goals worth more that the critic errs on, or that critics differ in?',
+        {
+            'FetchReach': _REACH,
+            'FetchPush': {**_LONG, 'total_steps': 600_000},
+            'FetchPickAndPlace': _PICK,
+        },
+        (
+            _arm('uniform', 'any future goal', goal_choice='uniform', critics=2),
+            _arm('bellman', 'greatest error of 8', goal_choice='bellman', critics=2),
+            _arm('uncertain', 'widest gap of 8', goal_choice='uncertain', critics=2),
+        ),
+    ),
+    Study(
+        'unbiased',
+        2,
+        'Does hindsight take a gamble for a sure thing, and what cures it?',
+        {'FetchReach': {**_REACH, 'gamble': True}, 'FetchPush': {**_SKILLED_PUSH, 'gamble': True}},
+        (
+            _arm('future', 'future goals', strategy='future'),
+            _arm(
+                'weighted',
+                'half future, half actual, importance weights',
+                goals=_HALF,
+                importance='density',
+            ),
+            _arm('actual', 'desired goals of any episode', goals='actual=.8'),
+            _arm('random', 'achieved goals of any episode', goals='random=.8'),
+            _arm('mixed', 'half future, half actual', goals=_HALF),
+            _arm('displaced', 'half actual, half displaced', goals='actual=.4,displaced=.4'),
+            _arm('none', 'no hindsight', strategy='none'),
+        ),
+    ),
+    Study(
+        'hierarchy',
+        3,
+        'Do subgoals get the actor to its goals in fewer steps?',
+        {
+            'FetchPickAndPlace': _PICK,
+            'HandManipulateBlockRotateXYZ': HAND,
+            'FetchReach': _REACH,
+            'FetchPush': _PUSH,
+            'FetchSlide': _SLIDE,
+        },
+        (
+            _arm('flat', 'no subgoals', subgoal_every=0),
+            _arm('every10', 'a subgoal every 10 ticks', subgoal_every=10),
+            _arm('prior', 'imagined subgoals, weight .3', subgoal_prior=0.3),
+            _arm('prior4', 'the same, imagination learnt every 4th time', **_RARE_PRIOR),
+        ),
+    ),
+    Study(
+        'values',
+        4,
+        'Do values of more than a goal help: of how close, or of how soon?',
+        {'HandReach': _SPARSE_HAND_REACH, 'FetchReach': _REACH},
+        (
+            _arm('none', 'the goal alone', condition='none'),
+            _arm('threshold', 'and the success threshold', condition='threshold'),
+            _arm('horizon', 'and the steps left', condition='horizon'),
+            _arm(
+                'threshold32',
+                'and the success threshold, four times as wide',
+                condition='threshold',
+                widest_threshold=32.0,
+            ),
+            # The thresholds without the input.
+            _arm('graded', 'the goal alone, graded rewards', reward_grades='.5,1,2,4,8,16,32'),
+        ),
+    ),
+    Study(
+        'targets',
+        5,
+        'Can targets move faster, or be left out?',
+        {'FetchReach': _REACH, 'FetchPush': _PUSH, 'FetchPickAndPlace': _PICK},
+        tuple(_targets()),
+    ),
+    Study(
+        'returns',
+        6,
+        'Do returns of several steps help data that is far from the policy?',
+        {'FetchReach': _REACH, 'FetchPush': _PUSH, 'FetchSlide': _SLIDE},
+        tuple(_returns()),
+    ),
+    Study(
+        'onpolicy',
+        7,
+        'Can an on-policy method use goals in hindsight?',
+        {
+            'FetchReach': {**_REACH, **_ON_POLICY, 'total_steps': 96_000, 'evaluate_every': 9_600},
+            'FetchPush': {**_LONG, **_ON_POLICY_PUSH, 'total_steps': 1_000_000},
+        },
+        (
+            _arm('none', 'no hindsight', strategy='none'),
+            _arm('taken', 'goals in hindsight, as if acted for', strategy='future'),
+            _arm(
+                'weighed',
+                'goals in hindsight, weighed per decision',
+                strategy='future',
+                importance='decision',
+            ),
+            _arm(
+                'moved',
+                'as if acted for, 4 of 5 from episodes that moved something',
+                strategy='future',
+                moved_share=0.8,
+            ),
+            _arm('outcome', 'what other episodes brought about', goals='outcome=.9'),
+        ),
+    ),
+    Study(
+        'ensembles',
+        8,
+        'Do several critics help, for the time that they cost?',
+        {'FetchReach': _REACH, 'FetchPickAndPlace': _PICK, 'HandManipulateBlockRotateZ': HAND},
+        tuple(_ensembles()),
+    ),
+    Study(
+        'rates',
+        9,
+        'What keeps learning alive where actions are very frequent?',
+        {
+            'FetchReach': {**_REACH, 'evaluation_episodes': 16},
+            # A replay for all ticks of a run at 250 Hz.
+            'FetchPush': {**_LONG, 'total_steps': 600_000, 'replay_transitions': 6_000_000},
+        },
+        tuple(_rates()),
+    ),
+    Study(
+        'ingredients',
+        None,
+        'What does each part of the recipe for the hand buy?',
+        {'HandManipulateEggRotate': _SCREENED, 'HandManipulateBlockRotateXYZ': _SCREENED},
+        (
+            _arm('best', 'the recipe'),
+            _arm('plain', 'plain features', goal_features='plain'),
+            _arm('few', '13 samples per step, not 51', batch_size=256),
+            _arm('future', 'future goals alone', strategy='future'),
+            _arm('graded', 'graded rewards', reward_grades='.5,1,2'),
+            _arm(
+                'displaced',
+                'half as many future goals, displaced ones instead',
+                goals='future=.2,actual=.2,displaced=.4',
+            ),
+            _arm('unbiased', 'displaced goals, no future ones', goals='actual=.4,displaced=.4'),
+            _arm('discount', 'discount 0.95, not 0.98', gamma=0.95),
+            _arm('prior4', 'imagined subgoals', **_RARE_PRIOR),
+            _arm('returns', 'returns of five steps', n_step=5),
+        ),
+        seeds=2,
+    ),
+)
+STUDIES = {study.name: study for study in _ALL}
