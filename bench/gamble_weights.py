@@ -29,7 +29,6 @@ from policy_node.training.research.gamble import is_over
 from policy_node.training.research.registry import (
     make_collector,
     make_learner,
-    make_sampler,
     make_simulation,
 )
 
@@ -61,8 +60,7 @@ def _learner_of(random: bool) -> tuple[WeightedDDPG, Experience]:
     config = recipe_config(TASK, 'best', **fields, random_epsilon=0.1, num_envs=EPISODES)
     spec, generator = task_spec(TASK), np.random.default_rng(0)
     simulation = make_simulation(config, EPISODES, 1)
-    sampler = make_sampler(config, simulation.metric)
-    parts = config, spec, torch.device('cpu'), Workers(), sampler, generator
+    parts = config, simulation.metric, torch.device('cpu'), Workers(), generator
     learner, experience = make_learner(*parts)
     assert isinstance(learner, WeightedDDPG)
     policy = RandomPolicy(spec.robot.action_size) if random else load_policy(TASK).policy

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import copy
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import torch
@@ -32,14 +31,13 @@ Goals = NDArray[np.float64]
 SMALLEST_THRESHOLD = 0.5
 
 
-def acting_input(config: TrainConfig) -> float | None:
-    """Return the input at which the actor acts; None without a condition.
+# Inputs at which the actor acts: the threshold of training, and a whole episode.
+_ACTING = {'threshold': 0.0, 'horizon': 1.0}
 
-    The threshold is that of training, the horizon a whole episode.
-    """
-    if config.condition == 'threshold':
-        return 0.0
-    return 1.0 if config.condition == 'horizon' else None
+
+def acting_input(config: TrainConfig) -> float | None:
+    """Return the input at which the actor acts; None without a condition."""
+    return _ACTING.get(config.condition)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -63,10 +61,20 @@ class ThresholdSampler(TransitionSampler):
 
     Attributes:
         widest: Largest multiple.
+
+    Raises:
+        ValueError: If it would replace the own reward of a third-party task.
     """
 
     metric: GoalMetric
     widest: float
+
+    def __post_init__(self) -> None:
+        if self.metric.has_own_reward:
+            replaced = own_reward(self.metric)
+            raise ValueError(
+                f'condition threshold would replace {replaced}; allowed: none, horizon'
+            )
 
     def transitions(
         self,
@@ -91,21 +99,6 @@ class ThresholdSampler(TransitionSampler):
         batch = self.several(starts, steps, goal, reward_after)
         condition = np.log(drawn).astype(np.float32)[:, None]
         return _conditioned(batch, condition, condition)
-
-
-def threshold_sampler(
-    fields: dict[str, Any], metric: GoalMetric, widest: float
-) -> TransitionSampler:
-    """Return a `ThresholdSampler`.
-
-    Raises:
-        ValueError: If it would replace the own reward of a third-party task.
-    """
-    if metric.has_own_reward:
-        raise ValueError(
-            f'condition threshold would replace {own_reward(metric)}; allowed: none, horizon'
-        )
-    return ThresholdSampler(**fields, metric=metric, widest=widest)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -150,13 +143,6 @@ class ConditionedDDPG(DDPG):
         actor.network = MLP(inputs, shape.action_size, shape)
         return actor, self.critic_loss.make(inputs, shape)
 
-    @property
-    def acting_input(self) -> float:
-        """The input at which the actor acts."""
-        value = acting_input(self.config)
-        assert value is not None
-        return value
-
     def tensors(self, batch: Transitions) -> TensorBatch:
         """As `DDPG`; the condition follows the features."""
         assert isinstance(batch, ConditionedTransitions)
@@ -169,11 +155,11 @@ class ConditionedDDPG(DDPG):
     def plain(self, network: MLP) -> Actor:
         """As `ActorCritic`, at the input at which the actor acts."""
         actor = copy.deepcopy(self.actor)
-        actor.network = fold(network, actor.shape, self.acting_input)
+        actor.network = fold(network, actor.shape, _ACTING[self.config.condition])
         return actor.cpu().eval()
 
     def _actions(self, features: Tensor) -> Array32:
-        acting = features.new_full((len(features), 1), self.acting_input)
+        acting = features.new_full((len(features), 1), _ACTING[self.config.condition])
         return super()._actions(torch.cat([features, acting], dim=-1))
 
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import replace
+from typing import cast
 
 import torch
 from torch import Tensor, nn
@@ -29,15 +30,11 @@ _MEMBERS = 'members.'
 Aggregate = Callable[[Tensor], Tensor]
 
 
-def _truncated(values: Tensor) -> Tensor:
-    """Return the mean without the highest value, as TQC drops the highest atoms."""
-    return values.sort(dim=0).values[:-1].mean(dim=0)
-
-
 AGGREGATES: dict[str, Aggregate] = {
     'mean': lambda values: values.mean(dim=0),
     'min': lambda values: values.amin(dim=0),
-    'truncated': _truncated,
+    # Without the highest value, as TQC drops the highest atoms.
+    'truncated': lambda values: values.sort(dim=0).values[:-1].mean(dim=0),
 }
 """Functions from the values (critics, batch) of an ensemble to one value each, (batch,)."""
 
@@ -55,12 +52,8 @@ class Ensemble(nn.Module):
 
     def outputs(self, features: Tensor, action: Tensor) -> Tensor:
         """Return the outputs of all members, (critics, batch, outputs), float32."""
-        return torch.stack([member.outputs(features, action) for member in self._critics()])
-
-    def _critics(self) -> Iterator[Critic]:
-        for member in self.members:
-            assert isinstance(member, Critic)
-            yield member
+        members = cast(Iterable[Critic], self.members)
+        return torch.stack([member.outputs(features, action) for member in members])
 
     def completed(self, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
         """Return the tensors, with its own for the members that they lack."""
@@ -142,15 +135,6 @@ class QuantileLoss(EnsembleLoss):
         return quantile_costs(quantiles, learner.clipped(target))
 
 
-def levels(count: int, like: Tensor) -> Tensor:
-    """Return the probabilities (count,) of the quantiles: the middles of equal shares.
-
-    Args:
-        count: Number of quantiles.
-    """
-    return (torch.arange(count, dtype=torch.float32, device=like.device) + 0.5) / count
-
-
 def sample_of(quantiles: Tensor, truncated: bool) -> Tensor:
     """Return the quantiles of all critics as one sample of the return, (batch, kept).
 
@@ -177,7 +161,9 @@ def quantile_costs(quantiles: Tensor, target: Tensor) -> Tensor:
     """
     error = target.unsqueeze(-2) - quantiles.unsqueeze(-1)
     huber = nn.functional.huber_loss(error, torch.zeros_like(error), reduction='none')
-    level = levels(quantiles.shape[-1], quantiles)[:, None]
+    # Probabilities of the quantiles: the middles of equal shares.
+    count = quantiles.shape[-1]
+    level = (torch.arange(count, dtype=torch.float32, device=error.device)[:, None] + 0.5) / count
     weight = (level - (error.detach() < 0.0).float()).abs()
     cost: Tensor = (weight * huber).mean(dim=(-2, -1))
     return cost
@@ -228,8 +214,6 @@ def hidden_layers(shape: NetworkShape, norm: str) -> NetworkShape:
 
 def critic_loss(options: Critics) -> CriticLoss:
     """Return the loss that the options select."""
-    if (options.critics, options.norm, options.quantiles) == (1, 'none', 1):
-        return CriticLoss()
     if options.quantiles > 1:
         return QuantileLoss(options)
     return BatchNormLoss(options) if options.norm == 'batch' else EnsembleLoss(options)

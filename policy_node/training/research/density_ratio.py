@@ -19,7 +19,7 @@ known. With `torchrun` each worker learns its own classifiers from its part of t
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 from torch import Tensor, nn
@@ -39,15 +39,8 @@ _NEAR = 20.0
 _SMALLEST_DISTANCE = 1e-3
 
 
-@dataclass(frozen=True, slots=True)
-class GoalView:
-    """A batch of transitions with certain goals, each tensor (batch, size)."""
-
-    features: Tensor
-    next_features: Tensor
-    achieved: Tensor
-    next_achieved: Tensor
-    goal: Tensor
+Inputs = tuple[Tensor, Tensor]
+"""Inputs (batch, size) of the classifiers without and with the next state."""
 
 
 class DensityRatio(nn.Module):
@@ -60,29 +53,23 @@ class DensityRatio(nn.Module):
         self.after = _classifier(before + feature_size + goal_size + 1)
         self.optimizer = torch.optim.Adam(self.parameters(), lr=_LEARNING_RATE)
 
-    def update(self, chosen: GoalView, shuffled: GoalView, action: Tensor) -> Tensor:
-        """Improve the classifiers on a batch and return its weights (batch,), of mean 1.
-
-        Args:
-            action: (batch, action_size).
-        """
-        logits = [self._logits(view, action) for view in (chosen, shuffled)]
-        labels = torch.stack([torch.ones(len(action)), torch.zeros(len(action))]).to(action)
-        loss = action.new_zeros(())
+    def update(self, chosen: Inputs, shuffled: Inputs) -> Tensor:
+        """Improve the classifiers on chosen and shuffled goals; return weights (batch,), mean 1."""
+        logits = [
+            (self.before(before).squeeze(-1), self.after(after).squeeze(-1))
+            for before, after in (chosen, shuffled)
+        ]
+        one = torch.ones_like(logits[0][0])
+        labels = torch.stack([one, torch.zeros_like(one)])
+        loss = one.new_zeros(())
         for pair in zip(*logits, strict=True):
             loss = loss + nn.functional.binary_cross_entropy_with_logits(torch.stack(pair), labels)
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]
         self.optimizer.step()
         before, after = (logit.detach() for logit in logits[0])
-        weight = (before - after).exp().clamp(max=MOST_WEIGHT)
+        weight: Tensor = (before - after).exp().clamp(max=MOST_WEIGHT)
         return weight / weight.mean()
-
-    def _logits(self, view: GoalView, action: Tensor) -> tuple[Tensor, Tensor]:
-        before = torch.cat([view.features, action, _difference(view.goal, view.achieved)], dim=-1)
-        led_to = torch.cat([view.next_features, _difference(view.goal, view.next_achieved)], dim=-1)
-        after = self.after(torch.cat([before, led_to], dim=-1))
-        return self.before(before).squeeze(-1), after.squeeze(-1)
 
 
 def _difference(goal: Tensor, achieved: Tensor) -> Tensor:
@@ -109,7 +96,8 @@ class WeightedDDPG(DDPG):
     def _set_up(self, shape: NetworkShape) -> None:
         sizes = shape.feature_size, shape.goal_size, shape.action_size
         self._ratio = DensityRatio(*sizes).to(self.device)
-        self._achieved_start = task_spec(self.config.task).achieved_goal_start
+        start = task_spec(self.config.task).achieved_goal_start
+        self._achieved = slice(start, start + shape.goal_size)
 
     def _update_critic(self, batch: TensorBatch) -> Tensor:
         self._weight = self._weights(batch)
@@ -120,20 +108,19 @@ class WeightedDDPG(DDPG):
 
     def _weights(self, batch: TensorBatch) -> Tensor:
         """Improve the classifiers and return the weights (batch,) of transitions."""
-        observation, next_observation = batch.observation, batch.next_observation
-        achieved = slice(self._achieved_start, self._achieved_start + batch.goal.shape[-1])
-        chosen = GoalView(
-            batch.features,
-            batch.next_features,
-            observation[:, achieved],
-            next_observation[:, achieved],
-            batch.goal,
-        )
         goal = batch.goal.roll(1, dims=0)
-        features = self.actor.features(observation, goal)
-        next_features = self.actor.features(next_observation, goal)
-        shuffled = replace(chosen, features=features, next_features=next_features, goal=goal)
-        return self._ratio.update(chosen, shuffled, batch.action)
+        features = self.actor.features(batch.observation, goal)
+        next_features = self.actor.features(batch.next_observation, goal)
+        shuffled = replace(batch, features=features, next_features=next_features, goal=goal)
+        return self._ratio.update(self._inputs(batch), self._inputs(shuffled))
+
+    def _inputs(self, batch: TensorBatch) -> Inputs:
+        achieved, led_to = (
+            _difference(batch.goal, seen[:, self._achieved])
+            for seen in (batch.observation, batch.next_observation)
+        )
+        before = torch.cat([batch.features, batch.action, achieved], dim=-1)
+        return before, torch.cat([before, batch.next_features, led_to], dim=-1)
 
     def importance(self, batch: Transitions) -> Array32:
         """Improve the classifiers on a batch and return its weights, (batch,)."""

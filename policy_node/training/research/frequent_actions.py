@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from torch import Tensor
 
 from fetch_hand_sim.simulation import Simulation
 from msgs_spec.arrays import Array32
 from msgs_spec.tasks import task_spec
 from policy_node.policies.actor import Actor
-from policy_node.policies.policy import Policy
+from policy_node.policies.policy import MemorylessPolicy, Policy
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.experience.collector import Collector, Observations
 from policy_node.training.experience.replay import Episodes, Starts
@@ -111,21 +109,14 @@ _MEASURED = 256
 _FIRST_SCALE = 0.05
 
 
-class PerturbedActors:
+class PerturbedActors(MemorylessPolicy):
     """Actors that each act for their share of the rows."""
 
     def __init__(self, actors: list[Actor]) -> None:
         self._actors = actors
 
-    def predict(
-        self,
-        observation: Mapping[str, ArrayLike],
-        state: Any = None,
-        episode_start: Any = None,
-        deterministic: bool = True,
-    ) -> tuple[NDArray[np.float32], None]:
+    def act(self, observation: Observations) -> Array32:
         """Return actions (N, action size) for observations (N, ...)."""
-        del state, episode_start, deterministic
         values = {name: np.asarray(rows) for name, rows in observation.items()}
         parts = np.array_split(np.arange(len(values['observation'])), len(self._actors))
         answers = [
@@ -133,7 +124,7 @@ class PerturbedActors:
             for actor, part in zip(self._actors, parts, strict=True)
             if len(part)
         ]
-        return np.concatenate(answers), None
+        return np.concatenate(answers)
 
 
 class PerturbingCollector(Collector):

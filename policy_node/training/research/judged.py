@@ -10,7 +10,7 @@ return before the first action that is far from the actor's for the same goal.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -55,25 +55,16 @@ SCORES: dict[str, Callable[[DDPG, Transitions], Array32]] = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class JudgedSampler(TransitionSampler):
-    """A sampler that may ask a learner.
-
-    Attributes:
-        judge: The learner; without it the sampler is a `TransitionSampler`.
-    """
-
-    judge: DDPG | None = None
-
-
-@dataclass(frozen=True, kw_only=True)
-class ChoosingSampler(JudgedSampler):
+class ChoosingSampler(TransitionSampler):
     """Takes the best of several future goals.
 
     Attributes:
+        judge: The learner that is asked.
         choice: `bellman` (largest error of the value) or `uncertain` (largest difference between
             critics).
     """
 
+    judge: DDPG
     choice: str
 
     def relabel(
@@ -82,23 +73,19 @@ class ChoosingSampler(JudgedSampler):
         """Draw goals and replace those from the future by better ones."""
         source = draw_sources(mixture, len(starts.row), generator)
         goal = goals_of(starts, source, list(mixture), generator)
-        if self.judge is None:
-            return goal
         rows = np.flatnonzero(np.array(list(mixture))[source] == 'future')
         if len(rows):
-            goal[rows] = self._best(self.judge, starts.select(rows), goal[rows], generator)
+            goal[rows] = self._best(starts.select(rows), goal[rows], generator)
         return goal
 
-    def _best(
-        self, judge: DDPG, starts: Starts, first: Array32, generator: np.random.Generator
-    ) -> Array32:
+    def _best(self, starts: Starts, first: Array32, generator: np.random.Generator) -> Array32:
         """Return the best of several future goals of each transition, (batch, goal_size)."""
         candidates, source = [first], np.zeros(len(first), np.intp)
         for _ in range(CANDIDATES - 1):
             candidates.append(goals_of(starts, source, ['future'], generator))
         repeated = starts.select(np.tile(np.arange(len(first)), CANDIDATES))
         batch = self.single(repeated, np.concatenate(candidates))
-        score = SCORES[self.choice](judge, batch)
+        score = SCORES[self.choice](self.judge, batch)
         # The first of equals.
         best: NDArray[np.intp] = score.reshape(CANDIDATES, -1).argmax(axis=0)
         return np.stack(candidates)[best, np.arange(len(first))]
@@ -119,13 +106,15 @@ class LambdaSampler(TransitionSampler):
 
 
 @dataclass(frozen=True, kw_only=True)
-class CuttingSampler(JudgedSampler):
+class CuttingSampler(TransitionSampler):
     """Returns that end before an action far from the actor's.
 
     Attributes:
+        judge: The learner that is asked.
         cut_distance: Largest distance from the actor's action, root mean square.
     """
 
+    judge: DDPG
     cut_distance: float = 0.3
 
     def steps(
@@ -133,8 +122,6 @@ class CuttingSampler(JudgedSampler):
     ) -> NDArray[np.int64]:
         """Return the steps (batch,) of each return."""
         most = super().steps(starts, goal, generator)
-        if self.judge is None:
-            return most
         steps = np.ones_like(most)
         episodes = starts.episodes
         for step in range(1, self.most_steps):
@@ -150,14 +137,19 @@ class CuttingSampler(JudgedSampler):
 
 
 class JudgedExperience(Experience):
-    """Batches from a `JudgedSampler`. Statistics are collected without the judge."""
+    """Batches from a sampler that asks the learner. Statistics are collected without it.
 
-    judge: DDPG
+    Attributes:
+        judged: The sampler of the batches.
+    """
+
+    judged: TransitionSampler
+
+    def narrow(self, progress: float) -> None:
+        """As `Experience`, with both samplers."""
+        super().narrow(progress)
+        self.judged = self.judged.at(progress)
 
     def _draw(self, mixture: dict[str, float]) -> Transitions:
-        unjudged = self._sampler
-        assert isinstance(unjudged, JudgedSampler)
-        self._sampler = replace(unjudged, judge=self.judge)
-        batch = super()._draw(mixture)
-        self._sampler = unjudged
-        return batch
+        replay, row = self.replay, self._draw_rows()
+        return self.judged.sample(replay.episodes, row, mixture, self.generator, replay.valid_ticks)

@@ -94,8 +94,10 @@ def make_collector(simulation: Simulation, seeds: list[int], config: TrainConfig
     return kind(simulation, seeds, config)
 
 
-def make_sampler(config: TrainConfig, metric: GoalMetric) -> TransitionSampler:
-    """Return what makes transitions.
+def make_sampler(
+    config: TrainConfig, metric: GoalMetric, judge: DDPG | None = None
+) -> TransitionSampler:
+    """Return what makes transitions; some samplers ask a learner, `judge`, if it is given.
 
     Raises:
         ValueError: If the configuration replaces the own reward of a third-party task.
@@ -103,44 +105,47 @@ def make_sampler(config: TrainConfig, metric: GoalMetric) -> TransitionSampler:
     fields = sampler_fields(config, metric)
     if config.longest_hold > 1:
         return frequent_actions.HoldingSampler(**fields | {'most_steps': config.longest_hold})
-    if config.goal_choice != 'uniform':
-        return judged.ChoosingSampler(**fields, choice=config.goal_choice)
+    if judge is not None and config.goal_choice != 'uniform':
+        return judged.ChoosingSampler(**fields, choice=config.goal_choice, judge=judge)
     if config.condition == 'horizon':
         return conditions.HorizonSampler(**fields, ticks=metric.spec.episode_ticks)
     if config.condition == 'threshold':
-        return conditions.threshold_sampler(fields, metric, config.widest_threshold)
+        widest = config.widest_threshold
+        return conditions.ThresholdSampler(**fields, metric=metric, widest=widest)
     if config.correction == 'lambda':
         return judged.LambdaSampler(**fields, trace=config.trace)
-    if config.correction == 'cut':
-        return judged.CuttingSampler(**fields)
+    if judge is not None and config.correction == 'cut':
+        return judged.CuttingSampler(**fields, judge=judge)
     if config.subgoal_every:
         return TransitionSampler(**fields, sources=hierarchy.LOW_SOURCES)
-    if config.algorithm == 'ppo':
-        return rollouts.RolloutSampler(**fields, metric=metric)
     return TransitionSampler(**fields)
 
 
 def make_learner(
     config: TrainConfig,
-    spec: TaskSpec,
+    metric: GoalMetric,
     device: torch.device,
     workers: Workers,
-    sampler: TransitionSampler,
     generator: np.random.Generator,
 ) -> tuple[ActorCritic, Experience]:
-    """Return the learner and its experience."""
-    common = config, spec, workers, sampler, generator
+    """Return the learner and its experience.
+
+    Raises:
+        ValueError: As `make_sampler`.
+    """
+    spec = metric.spec
+    common = config, spec, workers, make_sampler(config, metric), generator
     weigh = _weights_of(config, spec)
     if config.algorithm == 'ppo':
         ppo = PPO(network_shape(config), config, device, workers)
-        return ppo, rollouts.OnPolicyExperience(*common, ppo, weigh)
+        return ppo, rollouts.OnPolicyExperience(*common, ppo, metric, weigh)
     learner = make_ddpg(network_shape(config), config, device, workers)
     if config.subgoal_every:
         # The subgoal, and whether it is tested.
         return learner, hierarchy.HierarchicalExperience(*common, spec.goal.size + 1, weigh)
-    if isinstance(sampler, judged.JudgedSampler):
+    if config.goal_choice != 'uniform' or config.correction == 'cut':
         experience = judged.JudgedExperience(*common, weigh=weigh)
-        experience.judge = learner
+        experience.judged = make_sampler(config, metric, learner)
         return learner, experience
     return learner, Experience(*common, _extra_actions(config), weigh)
 

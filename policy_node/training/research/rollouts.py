@@ -234,13 +234,6 @@ def goals_in_hindsight(
     return goals_of(starts, source, list(mixture), generator, sources)
 
 
-@dataclass(frozen=True, kw_only=True)
-class RolloutSampler(TransitionSampler):
-    """A sampler with the metric of the task."""
-
-    metric: GoalMetric | None = None
-
-
 class OnPolicyExperience(Experience):
     """Whole episodes of the newest cycle, with their own goals and `hindsight_k` others each.
 
@@ -257,12 +250,13 @@ class OnPolicyExperience(Experience):
         sampler: TransitionSampler,
         generator: np.random.Generator,
         critique: PPO,
+        metric: GoalMetric,
         weigh: Weigh = has_moved,
     ) -> None:
         super().__init__(config, spec, workers, sampler, generator, weigh=weigh)
         limits = config.gamma, config.trace, config.importance == 'decision'
         self._maker = RolloutMaker(critique, sampler.compute_reward, *limits)
-        self._metric = sampler.metric if isinstance(sampler, RolloutSampler) else None
+        self._metric = metric
         self._newest = workers.share(config.num_envs)
         self._rollouts: RolloutTransitions | None = None
         self._made_after = -1
@@ -303,7 +297,7 @@ class OnPolicyExperience(Experience):
         mixture = super().mixture()
         mixture.pop('real', None)
         copies, outcomes = self.config.hindsight_k if mixture else 0, None
-        if _OUTCOME in mixture and self._metric is not None:
+        if _OUTCOME in mixture:
             past = self.replay.newest(_EPISODES)
             outcomes = Outcomes.of(past, self._metric, self.generator)
         goals = [

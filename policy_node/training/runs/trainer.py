@@ -33,7 +33,6 @@ from policy_node.training.machine import Workers, choose_device, split_threads
 from policy_node.training.research.registry import (
     make_collector,
     make_learner,
-    make_sampler,
     make_simulation,
 )
 from policy_node.training.runs.initial_networks import CRITIC_FIRST, InitialNetworks
@@ -145,10 +144,9 @@ class Trainer(BaseTrainer):
         origin = {} if init_from is None else init_from.origin
         super().__init__(config, output, workers, command, source_revision, origin)
         self.simulation = self._simulate(config, workers.share(config.num_envs))
-        sampler = make_sampler(config, self.simulation.metric)
         device, generator = choose_device(config.device), self._seed(env_steps=0)
         self.learner, self.experience = make_learner(
-            config, self.spec, device, workers, sampler, generator
+            config, self.simulation.metric, device, workers, generator
         )
         require_readable(self.learner)
         if init_from is not None:

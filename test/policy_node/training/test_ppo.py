@@ -18,7 +18,6 @@ from policy_node.policies.network_shape import NetworkShape
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.recipes import recipe_config
 from policy_node.training.experience.replay import Episodes, Starts
-from policy_node.training.experience.sampling import TransitionSampler
 from policy_node.training.machine import Workers
 from policy_node.training.research.ppo import PPO, RolloutTransitions, log_probability
 from policy_node.training.research.registry import make_learner
@@ -281,11 +280,8 @@ def test_rollouts_hold_every_episode_once_for_each_goal() -> None:
 def test_a_share_of_a_batch_is_from_episodes_that_moved_the_object(share: float) -> None:
     config = recipe_config('FetchPush', 'best', **ON_POLICY, moved_share=share, batch_size=4000)
     spec, generator = task_spec('FetchPush'), np.random.default_rng(0)
-    sampler = TransitionSampler(
-        lambda achieved, desired: -1.0 * (np.linalg.norm(achieved - desired, axis=-1) > 0.05), 0.98
-    )
     cpu = torch.device('cpu')
-    _, experience = make_learner(config, spec, cpu, Workers(), sampler, generator)
+    _, experience = make_learner(config, GoalMetric(spec), cpu, Workers(), generator)
     count, ticks = config.num_envs, spec.episode_ticks
     observation = np.zeros((count, ticks + 1, spec.observation_size), np.float32)
     observation[:, :, 0] = np.arange(count)[:, None]
