@@ -9,7 +9,7 @@ from types import MappingProxyType
 from typing import Any
 
 from msgs_spec.tick import EpisodeStatus
-from node_runtime.diagnostics import ASKED_RATE, MODE, PAUSED, RATE, Increase, Report
+from node_runtime.diagnostics import ASKED_RATE, MODE, PAUSED, RATE, Report
 from node_runtime.ros import MEMORY_OF_THE_GRAPH
 from policy_node.node.responder import Responder
 
@@ -19,6 +19,7 @@ _SILENCE = 2.0
 _SLOWEST = 100.0
 # A robot that restarts turns back once; so does a replay that is repeated.
 _TURNS_OF_ONE = 1
+_COUNTERS = ('answered', 'failed', 'turned_back', 'unusable')
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +61,8 @@ class Health:
         self._name = name
         self._responder: Responder | None = None
         self._tick_duration = 0.0
-        self._begin_counting()
+        # Counters of the last report.
+        self._before: dict[str, int] = {}
         self._then = 0.0
         # Last time without a second robot and without a second publisher of a topic.
         self._alone_at = -math.inf
@@ -70,12 +72,7 @@ class Health:
         """Begin to report on a robot; `now` is in seconds of the responder's clock."""
         self._responder, self._then = responder, now
         self._tick_duration = 1.0 / status.control_hz
-        self._begin_counting()
-
-    def _begin_counting(self) -> None:
-        self._answered, self._dropped = Increase(), Increase()
-        self._unusable, self._failed = Increase(), Increase()
-        self._turned_back = Increase()
+        self._before = {}
 
     def stop(self) -> None:
         """Wait for a robot again."""
@@ -100,10 +97,13 @@ class Health:
             missing: Required topics without a publisher.
             publishers: Number of publishers by topic.
         """
+        turns_back = 0
         if self._responder is None:
             report = Report(self._name, '', {'robots': str(robots)}, 'waits for a robot')
         else:
-            report = self._report(self._responder, now, robots, pace)
+            new = self._grown(self._responder)
+            turns_back = new['turned_back'] // len(self._responder.topics)
+            report = self._report(self._responder, new, now, robots, pace)
         if robots == 0 and elsewhere:
             report.warn(
                 f'no robot here: found in {", ".join(elsewhere)}; join it with '
@@ -114,23 +114,22 @@ class Health:
         shared = [
             f'{count} publishers of {name}' for name, count in publishers.items() if count > 1
         ]
-        is_mixed = self._turns_back() > _TURNS_OF_ONE
         if robots <= 1 and not shared:
             self._alone_at = now
         # The graph still lists a robot that was killed, but only its successor publishes.
-        elif is_mixed or now - self._alone_at > MEMORY_OF_THE_GRAPH:
+        elif turns_back > _TURNS_OF_ONE or now - self._alone_at > MEMORY_OF_THE_GRAPH:
             if robots > 1:
                 report.warn(f'{robots} robots publish here; give each a namespace')
             else:
                 report.warn(f'several sources of state: {", ".join(shared)}')
         return report
 
-    def _turns_back(self) -> int:
-        """Return the mean number, per topic, of messages older than the one before."""
-        if self._responder is None:
-            return 0
-        turned = self._turned_back.since(self._responder.turned_back)
-        return int(turned) // len(self._responder.topics)
+    def _grown(self, responder: Responder) -> dict[str, int]:
+        """Return the growth of the counters since the last report."""
+        counters = {name: getattr(responder, name) for name in _COUNTERS}
+        counters['dropped'] = responder.join.dropped
+        before, self._before = self._before, counters
+        return {name: count - before.get(name, 0) for name, count in counters.items()}
 
     def news(self, report: Report) -> list[str]:
         """Return the problems that are new in the last report, without numbers."""
@@ -140,12 +139,16 @@ class Health:
         return fresh
 
     def _report(
-        self, responder: Responder, now: float, robots: int, robot_pace: Pace | None
+        self,
+        responder: Responder,
+        new: Mapping[str, int],
+        now: float,
+        robots: int,
+        robot_pace: Pace | None,
     ) -> Report:
         given = robot_pace or Pace(is_paused=False, period=self._tick_duration)
         seconds, self._then = now - self._then, now
-        answered = self._answered.since(responder.answered)
-        rate = answered / seconds if seconds else 0.0
+        rate = new['answered'] / seconds if seconds else 0.0
         age = None if responder.received_at is None else now - responder.received_at
         inference = responder.inference.milliseconds()
         values = {
@@ -163,15 +166,12 @@ class Health:
         task = responder.policy.task
         pace = 'the robot is paused' if given.is_paused else f'{rate:.1f} commands per second'
         report = Report(self._name, task, values, f'{task}: {pace}')
-        dropped = self._dropped.since(responder.join.dropped)
-        if dropped:
-            report.warn(f'incomplete ticks: {dropped:.0f} dropped')
-        failed = self._failed.since(responder.failed)
-        if failed:
-            report.fail(f'no command: {failed:.0f} times, {responder.last_failure}')
-        unusable = self._unusable.since(responder.unusable)
-        if unusable:
-            report.warn(f'unusable messages: {unusable:.0f}')
+        if new['dropped']:
+            report.warn(f'incomplete ticks: {new["dropped"]} dropped')
+        if new['failed']:
+            report.fail(f'no command: {new["failed"]} times, {responder.last_failure}')
+        if new['unusable']:
+            report.warn(f'unusable messages: {new["unusable"]}')
         if inference['p50'] != '-' and float(inference['p50']) > 1e3 * given.period > 0.0:
             report.warn(
                 f'slow inference: {inference["p50"]} ms, a tick is {1e3 * given.period:.1f} ms; '

@@ -135,7 +135,8 @@ class PolicyNode(Node):
         ]
         self._of_robot += state
         began = time.monotonic()
-        while missing := self._unpublished(state):
+        names = [each.topic_name for each in state]
+        while missing := [name for name in names if not self.count_publishers(name)]:
             loop.wait(BEAT)
             if stop or self._has_robot_changed() or self._is_replaced:
                 return
@@ -146,11 +147,6 @@ class PolicyNode(Node):
         self._of_robot.append(self._commands)
         self._health.start(responder, status, time.monotonic())
         self.get_logger().info(f'{policy.task}: commands come from {policy.description}')
-
-    def _unpublished(self, subscriptions: list[Subscription]) -> list[str]:
-        """Return the topics without a publisher, by their (possibly remapped) names."""
-        names = [each.topic_name for each in subscriptions]
-        return [name for name in names if not self.count_publishers(name)]
 
     def _load_for(self, status: EpisodeStatus) -> LoadedPolicy:
         """Return the policy for a robot.
