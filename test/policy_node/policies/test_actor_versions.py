@@ -31,11 +31,8 @@ def observations() -> dict[str, np.ndarray]:
     return {'observation': state, 'achieved_goal': state[:, :3], 'desired_goal': goal}
 
 
-def test_the_file_is_the_one_that_was_shipped() -> None:
+def test_an_actor_of_version_0_1_loads_and_acts_as_it_did() -> None:
     assert hashlib.sha256(OLD.read_bytes()).hexdigest() == SHA256
-
-
-def test_it_loads_and_acts_as_it_did() -> None:
     loaded = load_policy(OLD)
     assert loaded.task == 'FetchReach'
     for actor in (loaded.policy, load_actor(OLD, 'FetchReach')):

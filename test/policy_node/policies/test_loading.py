@@ -6,18 +6,19 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from threadpoolctl import threadpool_info
 
 from msgs_spec.tasks import TASKS, task_spec
 from policy_node import load_actor, load_policy
 from policy_node.policies import checkpoint, loading
+from policy_node.policies.actor import Normalizer
 from policy_node.policies.loading import TaskMissing, shipped_actors
 from policy_node.policies.numpy_actor import NumpyActor
-from policy_node.policies.policy import Policy, RandomPolicy
+from policy_node.policies.policy import Policy, RandomPolicy, past_after, past_before
 from support.fresh_actor import fresh_actor, observations
 
 
@@ -33,18 +34,6 @@ def test_shipped_actors_answer_as_torch_does(name: str) -> None:
         wanted, _ = actor.predict(observation)
         assert action.shape == wanted.shape and action.dtype == np.float32
         np.testing.assert_allclose(action, wanted, atol=5e-4)
-
-
-@pytest.mark.parametrize('name', ['FetchReach', 'random', 'resting'])
-def test_policies_are_asked_as_stable_baselines3_asks(name: str) -> None:
-    policy: Any = load_policy(name, 'FetchReach').policy
-    observation = observations(task_spec('FetchReach'), 2)
-    # As its `fetch_hand_sim evaluate` does.
-    starts = np.ones(2, dtype=bool)
-    action, state = policy.predict(
-        observation, state=None, episode_start=starts, deterministic=True
-    )
-    assert action.shape == (2, 4) and state is None
 
 
 @pytest.mark.parametrize('task', ['FetchSlide', 'HandReach', 'HandManipulateBlockFull'])
@@ -71,13 +60,37 @@ def test_a_batch_is_answered_as_its_rows() -> None:
 
 
 @pytest.mark.parametrize('load', [load_actor, lambda task: load_policy(task).policy])
-def test_one_goal_may_be_that_of_a_whole_batch(load: Callable[[str], Policy]) -> None:
+def test_parts_of_an_observation_fit_each_other_and_the_task(load: Callable[[str], Policy]) -> None:
+    """One goal may be that of a whole batch."""
     policy, batch = load('FetchPush'), observations(task_spec('FetchPush'), 5)
     one = {**batch, 'desired_goal': batch['desired_goal'][2]}
     each = {**batch, 'desired_goal': np.tile(one['desired_goal'], (5, 1))}
     np.testing.assert_array_equal(policy.predict(one)[0], policy.predict(each)[0])
     with pytest.raises(ValueError, match=r'\(5, 25\), desired_goal \(4, 3\)'):
         policy.predict({**batch, 'desired_goal': batch['desired_goal'][:4]})
+    with pytest.raises(ValueError, match=r'\(5, 24\)'):
+        policy.predict({**batch, 'observation': batch['observation'][:, :24]})
+    with pytest.raises(ValueError, match="'desired_goal'"):
+        policy.predict({'observation': batch['observation']})
+
+
+def test_inputs_are_clipped_then_scaled_then_clipped() -> None:
+    normalizer = Normalizer(4)
+    normalizer.mean.copy_(torch.tensor([0.0, 1.0, 150.0, 0.0]))
+    normalizer.std.copy_(torch.tensor([1.0, 2.0, 25.0, 0.01]))
+    values = normalizer(torch.tensor([-3.0, 2.0, 1e9, 1.0]))
+    assert values.tolist() == [-3.0, 0.5, 2.0, 5.0]
+
+
+def test_past_actions_begin_as_zeros_and_the_newest_comes_first() -> None:
+    past = past_before(None, None, (1,), 4)
+    for number in (1.0, 2.0, 3.0):
+        past = past_after(past, np.full((1, 2), number, np.float32))
+    assert past.tolist() == [[3.0, 3.0, 2.0, 2.0]]
+    state = np.ones((2, 4), np.float32)
+    assert past_before(state, [True, False], (2,), 4).tolist() == [[0.0] * 4, [1.0] * 4]
+    with pytest.raises(ValueError, match=r'\(2, 4\).*\(3, 4\)'):
+        past_before(state, None, (3,), 4)
 
 
 @pytest.mark.filterwarnings('error')
@@ -113,8 +126,9 @@ def test_policies_without_training(task: str, name: str) -> None:
     found = load_policy(name, task)
     assert (found.task, found.control_hz, found.sha256) == (task, None, '')
     for leading in ((), (5,)):
-        action, _ = found.policy.predict(observations(spec, *leading))
-        assert action.shape == (*leading, spec.robot.action_size)
+        # With all arguments of Stable-Baselines3.
+        action, state = found.policy.predict(observations(spec, *leading), None, None, True)
+        assert action.shape == (*leading, spec.robot.action_size) and state is None
         assert (np.abs(action) <= 1.0).all() and bool(action.any()) == (name == 'random')
 
 
@@ -123,9 +137,16 @@ def test_random_actions_are_alike_for_equal_seeds_and_fill_the_range() -> None:
     first, again, other = (RandomPolicy(4, seed).predict(observation)[0] for seed in (1, 1, 2))
     assert (first == again).all() and (first != other).any()
     assert -1 <= first.min() < -0.99 and 0.99 < first.max() <= 1
+    # The actions of an episode depend on its seed only, wherever it runs.
+    policies = RandomPolicy(4), RandomPolicy(4)
+    for policy, seeds in zip(policies, ([5, 6, 7], [7, 8, 9]), strict=True):
+        policy.start(seeds)
+    ours, theirs = (policy.predict({'observation': np.zeros((3, 10))})[0] for policy in policies)
+    assert (ours[2] == theirs[0]).all() and len(np.unique(ours[:, 0])) == 3
+    assert (np.abs(ours) <= 1.0).all()
 
 
-def test_no_name_is_the_shipped_actor_of_the_task(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_name_without_a_task_needs_one(monkeypatch: pytest.MonkeyPatch) -> None:
     assert load_policy('', 'FetchPush').description == 'actor FetchPush.safetensors'
     assert shipped_actors().keys() >= TASKS.keys()
     # A task of another package has none.
@@ -136,31 +157,26 @@ def test_no_name_is_the_shipped_actor_of_the_task(monkeypatch: pytest.MonkeyPatc
         load_policy('', 'HandReach')
     with pytest.raises(ValueError, match=r'robust .*HandManipulateEggFull .*FetchReach'):
         load_policy('robust', 'HandManipulateEggFull')
-
-
-@pytest.mark.parametrize('name', ['random', 'resting', ''])
-def test_a_missing_task_has_its_own_error(name: str) -> None:
-    with pytest.raises(TaskMissing, match='FetchReach, '):
-        load_policy(name)
+    for name in ('random', 'resting', ''):
+        with pytest.raises(TaskMissing, match='FetchReach, '):
+            load_policy(name)
 
 
 def test_unknown_and_unfitting_names_are_refused_in_one_line(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"'zzz'.*FetchReach.*'random', 'resting' or 'robust'$"):
-        load_policy('zzz', 'FetchReach')
-    for mistyped, meant in {'rnd': 'random', 'fetchreach': 'FetchReach'}.items():
-        with pytest.raises(ValueError, match=rf"'robust'; did you mean '{meant}'\?$"):
-            load_policy(mistyped, 'FetchReach')
-    with pytest.raises(ValueError, match='trained on FetchReach, not on FetchPush'):
-        load_policy('FetchReach', 'FetchPush')
-    with pytest.raises(ValueError, match='no actor'):
-        load_policy(tmp_path)
-    with pytest.raises(ValueError, match='File name too long'):
-        load_policy('x' * 300, 'FetchReach')
-    with pytest.raises(ValueError, match=r'gone.onnx'):
-        load_policy(tmp_path / 'gone.onnx')
-    (tmp_path / 'best.safetensors').touch()
-    with pytest.raises(ValueError, match=r'/best\.safetensors$'):
-        load_policy(tmp_path)
+    (tmp_path / 'run').mkdir()
+    (tmp_path / 'run' / 'best.safetensors').touch()
+    for name, task, line in (
+        ('zzz', 'FetchReach', r"'zzz'.*FetchReach.*'random', 'resting' or 'robust'$"),
+        ('rnd', 'FetchReach', r"'robust'; did you mean 'random'\?$"),
+        ('fetchreach', 'FetchReach', r"'robust'; did you mean 'FetchReach'\?$"),
+        ('FetchReach', 'FetchPush', 'trained on FetchReach, not on FetchPush'),
+        (tmp_path, None, 'no actor'),
+        ('x' * 300, 'FetchReach', 'File name too long'),
+        (tmp_path / 'gone.onnx', None, r'gone.onnx'),
+        (tmp_path / 'run', None, r'/best\.safetensors$'),
+    ):
+        with pytest.raises(ValueError, match=line):
+            load_policy(name, task)
 
 
 def test_finite_weights_give_finite_actions_however_large(tmp_path: Path) -> None:
@@ -172,23 +188,15 @@ def test_finite_weights_give_finite_actions_however_large(tmp_path: Path) -> Non
     assert np.isfinite(actor.predict(observations(task_spec('FetchReach')))[0]).all()
 
 
-def _modules_after(code: str) -> set[str]:
-    code += "\nimport sys; print(*sorted(name.partition('.')[0] for name in sys.modules))"
-    result = subprocess.run(
-        [sys.executable, '-c', code], capture_output=True, text=True, timeout=120
-    )
-    assert result.returncode == 0, result.stderr
-    return set(result.stdout.split())
-
-
-@pytest.mark.parametrize('name', ['FetchReach', 'random', 'resting'])
-def test_acting_needs_no_torch(name: str) -> None:
-    code = (
-        'import numpy as np; from policy_node import load_policy\n'
-        "ones = {'observation': np.ones(10), 'desired_goal': np.ones(3)}\n"
-        f"load_policy({name!r}, 'FetchReach').policy.predict(ones)"
-    )
-    assert 'torch' not in _modules_after(code)
+def test_acting_needs_no_torch() -> None:
+    code = """
+import sys
+from policy_node import load_policy
+for name in ('FetchReach', 'random', 'resting'):
+    load_policy(name, 'FetchReach')
+assert 'torch' not in sys.modules
+"""
+    subprocess.run([sys.executable, '-c', code], check=True, timeout=120)
 
 
 @pytest.mark.parametrize('name', ['FetchReach', 'random'])
@@ -196,14 +204,3 @@ def test_a_flattened_observation_is_rejected(name: str) -> None:
     policy = load_policy(name, 'FetchReach').policy
     with pytest.raises(TypeError, match='ndarray'):
         policy.predict(np.zeros(16))  # type: ignore[arg-type]
-
-
-def test_random_episodes_are_alike_for_equal_seeds_wherever_they_run() -> None:
-    observation = {'observation': np.zeros((3, 10))}
-    first, second = RandomPolicy(4), RandomPolicy(4)
-    first.start([5, 6, 7])
-    second.start([7, 8, 9])
-    ours, theirs = (policy.predict(observation)[0] for policy in (first, second))
-    assert (ours[2] == theirs[0]).all()
-    assert len(np.unique(ours[:, 0])) == 3
-    assert (np.abs(ours) <= 1.0).all()

@@ -5,9 +5,11 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+import gymnasium
 import numpy as np
 import pytest
 
+from fetch_hand_sim.films.playing import film_episode
 from msgs_spec.tasks import task_spec
 from policy_node import load_policy
 from policy_node.training.evaluate_policy import main as evaluate
@@ -93,11 +95,8 @@ def module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
 
 def test_an_object_acts_with_its_predict(module: str) -> None:
     found = load_policy(f'{module}:model', 'FetchReach', trust=True)
-    assert (found.task, found.description, found.control_hz) == (
-        'FetchReach',
-        f'{module}:model',
-        50.0,
-    )
+    about = found.task, found.description, found.control_hz
+    assert about == ('FetchReach', f'{module}:model', 50.0)
     action, _ = found.policy.predict(observations(task_spec('FetchReach'), 3))
     assert action.tolist() == np.full((3, 4), 0.25).tolist()
     bare = load_policy(f'{module}:Bare', 'FetchReach', trust=True)
@@ -157,12 +156,7 @@ def test_a_function_is_evaluated_as_any_policy(
 
 @pytest.mark.parametrize(
     ('function', 'line'),
-    [
-        ('nan', 'nan'),
-        ('outside', '1.5'),
-        ('short', '(2, 3)'),
-        ('stops', 'ZeroDivisionError'),
-    ],
+    [('nan', 'nan'), ('outside', '1.5'), ('short', '(2, 3)'), ('stops', 'ZeroDivisionError')],
 )
 def test_a_policy_that_fails_later_is_one_line(
     module: str, function: str, line: str, capsys: pytest.CaptureFixture[str]
@@ -172,3 +166,20 @@ def test_a_policy_that_fails_later_is_one_line(
     error = capsys.readouterr().err
     assert error.startswith(f'fetch_hand_sim evaluate: {module}:{function} ')
     assert line in error and error.count('\n') == 1
+
+
+def test_a_film_passes_the_state_on() -> None:
+    states = []
+
+    class Counting:
+        def predict(self, observation, state=0, *, deterministic=True):
+            states.append(state)
+            return np.zeros(4), state + 1
+
+    class Blank(gymnasium.Wrapper):
+        def render(self):
+            return np.zeros((16, 16, 3), np.uint8)
+
+    env = gymnasium.make('fetch_hand_sim/FetchReach-v0', render_mode='rgb_array')
+    film_episode(gymnasium.wrappers.TimeLimit(Blank(env.unwrapped), 3), Counting(), seed=0)
+    assert states == [0, 1, 2]
