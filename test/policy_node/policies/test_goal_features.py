@@ -10,6 +10,7 @@ from msgs_spec.rotations import (
     quaternion_conjugate,
     quaternion_from_axis_angle,
     quaternion_multiply,
+    quaternion_to_matrix,
 )
 from msgs_spec.tasks import TASKS, GoalKind, task_spec
 from policy_node.policies.actor import Actor
@@ -17,22 +18,27 @@ from policy_node.policies.goal_features import RelativeGoal, goal_features
 from policy_node.policies.network_shape import NetworkShape
 from support.tasks import each_task
 
-
-def relative_goal(task: str) -> RelativeGoal:
-    features = goal_features('relative', task_spec(task))
-    assert isinstance(features, RelativeGoal)
-    return features
-
-
 POSE_TASKS = [name for name, spec in TASKS.items() if spec.goal is GoalKind.POSE]
 
 
 def _observation(task: str, achieved: np.ndarray) -> torch.Tensor:
+    """Observations (..., size) with these achieved goals (..., goal size)."""
     spec = task_spec(task)
-    observation = np.random.default_rng(1).normal(size=spec.observation_size)
+    row = np.random.default_rng(1).normal(size=spec.observation_size)
+    observation = np.tile(row, (*achieved.shape[:-1], 1))
     start = spec.achieved_goal_start
-    observation[start : start + spec.goal.size] = achieved
+    observation[..., start : start + spec.goal.size] = achieved
     return torch.from_numpy(observation)
+
+
+def _difference(task: str, achieved: np.ndarray, goal: np.ndarray) -> np.ndarray:
+    features = goal_features('relative', task_spec(task))
+    assert isinstance(features, RelativeGoal)
+    return features.difference(_observation(task, achieved), torch.from_numpy(goal)).numpy()
+
+
+def _pose(position: object, quaternion: object) -> np.ndarray:
+    return np.concatenate([position, quaternion], dtype=float)
 
 
 @each_task
@@ -64,59 +70,47 @@ def test_the_number_of_inputs_matches_the_shape(task: str, kind: str) -> None:
 
 
 def test_rotation_is_goal_times_conjugate_with_its_sign() -> None:
-    generator = np.random.default_rng(0)
-    achieved = np.concatenate([np.zeros(3), quaternion_from_axis_angle([1, 2, 3], 0.4)])
+    achieved = quaternion_from_axis_angle([1, 2, 3], 0.4)
     for sign in (1.0, -1.0):
-        quaternion = sign * quaternion_from_axis_angle(generator.normal(size=3), 2.0)
-        goal = np.concatenate([np.zeros(3), quaternion])
-        observation = _observation('HandManipulateBlockFull', achieved)
-        features = relative_goal('HandManipulateBlockFull').difference
-        values = features(observation, torch.from_numpy(goal)).numpy()
-        expected = quaternion_multiply(quaternion, quaternion_conjugate(achieved[3:]))
+        goal = sign * quaternion_from_axis_angle([0.1, -0.1, 0.6], 2.0)
+        poses = (_pose(np.zeros(3), quaternion) for quaternion in (achieved, goal))
+        values = _difference('HandManipulateBlockFull', *poses)
+        expected = quaternion_multiply(goal, quaternion_conjugate(achieved))
         np.testing.assert_allclose(values[:4], expected, atol=1e-12)
         np.testing.assert_allclose(values[4:7], np.clip(10 * expected[1:], -5, 5), atol=1e-12)
 
 
 def test_position_counts_only_in_tasks_that_specify_it() -> None:
-    achieved, goal = np.zeros(7), np.array([0.01, -0.02, 0.5, 1.0, 0.0, 0.0, 0.0])
-    achieved[3] = 1.0
+    achieved, goal = (_pose(place, [1, 0, 0, 0]) for place in ([0, 0, 0], [0.01, -0.02, 0.5]))
     for task in POSE_TASKS:
-        values = relative_goal(task).difference(
-            _observation(task, achieved), torch.from_numpy(goal)
-        )
         wanted = [0.5, -1.0, 5.0] if task.endswith('Full') else [0.0, 0.0, 0.0]
-        np.testing.assert_allclose(values[7:], wanted, atol=1e-12)
+        np.testing.assert_allclose(_difference(task, achieved, goal)[7:], wanted, atol=1e-12)
 
 
 def test_turning_the_pen_about_its_own_axis_changes_nothing() -> None:
-    features = relative_goal('HandManipulatePenFull').difference
     start = quaternion_from_axis_angle([1, 1, 0], 0.7)
-    goal = torch.from_numpy(np.concatenate([np.zeros(3), quaternion_from_axis_angle([1, 0, 0], 1)]))
     turned = quaternion_multiply(start, quaternion_from_axis_angle([0, 0, 1], 1.3))
-    first, second = (
-        features(_observation('HandManipulatePenFull', np.concatenate([np.zeros(3), q])), goal)
-        for q in (start, turned)
-    )
+    goal = _pose(np.zeros(3), quaternion_from_axis_angle([1, 0, 0], 1))
+    poses = np.stack([_pose(np.zeros(3), quaternion) for quaternion in (start, turned)])
+    first, second = _difference('HandManipulatePenFull', poses, np.stack([goal, goal]))
     np.testing.assert_allclose(first, second, atol=1e-12)
-    assert abs(float(first[0])) < 0.999
+    assert abs(first[0]) < 0.999
 
 
 def test_points_are_differences() -> None:
-    features = relative_goal('FetchSlide').difference
-    observation = _observation('FetchSlide', np.array([1.0, 0.5, 0.4]))
-    values = features(observation, torch.tensor([1.6, 0.49, 0.4], dtype=torch.float64))
+    values = _difference('FetchSlide', np.array([1.0, 0.5, 0.4]), np.array([1.6, 0.49, 0.4]))
     np.testing.assert_allclose(values, [0.6, -0.01, 0, 5.0, -0.1, 0], atol=1e-12)
 
 
 def _pose_inputs(task: str, pose: np.ndarray, angular: np.ndarray, goal: np.ndarray) -> np.ndarray:
-    """Symmetric inputs of an object pose, angular velocity (object frame) and goal."""
+    """Symmetric inputs of poses (..., 7), an angular velocity (object frame) and a goal."""
     spec = task_spec(task)
     features = goal_features('symmetric', spec)
     assert features is not None
     observation = _observation(task, pose)
     start = spec.achieved_goal_start
-    observation[start - 3 : start] = torch.from_numpy(angular)
-    arguments = observation, torch.from_numpy(goal)
+    observation[..., start - 3 : start] = torch.from_numpy(angular)
+    arguments = observation, torch.from_numpy(np.broadcast_to(goal, pose.shape).copy())
     return features.inputs(arguments, arguments).numpy()
 
 
@@ -155,7 +149,7 @@ def test_poses_that_look_alike_are_one_and_others_are_not(task: str) -> None:
         turned, turned_goal = pose.copy(), goal.copy()
         turned[3:] = quaternion_multiply(pose[3:], symmetry)
         turned_goal[3:] = quaternion_multiply(goal[3:], symmetry)
-        seen = _rotated(angular, quaternion_conjugate(symmetry))
+        seen = quaternion_to_matrix(symmetry).T @ angular
         np.testing.assert_allclose(
             _pose_inputs(task, turned, seen, turned_goal), before, atol=1e-12
         )
@@ -166,25 +160,14 @@ def test_poses_that_look_alike_are_one_and_others_are_not(task: str) -> None:
 
 def test_all_rotations_of_a_cube_but_its_symmetries_differ() -> None:
     spec = task_spec('HandManipulateBlockRotateXYZ')
-    start = spec.achieved_goal_start
-    generator = np.random.default_rng(3)
-    goal = np.array([0.0, 0, 0, 1, 0, 0, 0])
-    poses = generator.normal(size=(200, 7))
+    poses = np.random.default_rng(3).normal(size=(200, 7))
     poses[:, :3] = 0.0
     poses[:, 3:] /= np.linalg.norm(poses[:, 3:], axis=1, keepdims=True)
-    first = start - 3 + 3 + 3
-    shapes = [
-        _pose_inputs(spec.name, pose, np.zeros(3), goal)[first : first + 15] for pose in poses
-    ]
-    distances = np.linalg.norm(np.subtract.outer(shapes, shapes).diagonal(0, 1, 3), axis=-1)
+    # After the position and the angular velocity.
+    first = spec.achieved_goal_start + 3
+    goal = _pose(np.zeros(3), [1, 0, 0, 0])
+    shapes = _pose_inputs(spec.name, poses, np.zeros(3), goal)[:, first : first + 15]
+    distances = np.linalg.norm(shapes[:, None] - shapes, axis=-1)
     np.fill_diagonal(distances, np.inf)
     assert distances.min() > 0.02
     assert np.std(shapes, axis=0).min() > 0.2
-
-
-def _rotated(vector: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
-    pure = np.concatenate([[0.0], vector])
-    turned = quaternion_multiply(
-        quaternion_multiply(quaternion, pure), quaternion_conjugate(quaternion)
-    )
-    return turned[1:]
