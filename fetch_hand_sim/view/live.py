@@ -14,7 +14,7 @@ from rclpy.node import Node
 from fetch_hand_sim.simulation.rewards import GoalMetric
 from fetch_hand_sim.view.curves import History
 from fetch_hand_sim.view.picture import ONLY_WATCHED, Facts, Picture
-from fetch_hand_sim.view.requests import LatestRequest, Request, SetCommand, SetCommanding, SetGoal
+from fetch_hand_sim.view.requests import Request, SetCommand, SetCommanding, SetGoal
 from fetch_hand_sim.view.robot_requests import RobotRequests
 from fetch_hand_sim.view.robot_watch import (
     ANY_TASK,
@@ -112,7 +112,7 @@ class LiveRobot:
         )
         return dataclasses.replace(history.picture, graphs=history.curves.graphs(), facts=facts)
 
-    def perform(self, request: Request | LatestRequest) -> None:
+    def perform(self, request: Request) -> None:
         """Perform a request, unless the page may only watch."""
         if not self._may_command:
             self._update_facts(notice=ONLY_WATCHED)

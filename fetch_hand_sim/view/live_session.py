@@ -24,7 +24,7 @@ from fetch_hand_sim.commands.node_processes import (
 from fetch_hand_sim.view.guard import Attendance
 from fetch_hand_sim.view.live import LiveRobot
 from fetch_hand_sim.view.page.page import Page
-from fetch_hand_sim.view.requests import LatestRequest, Request
+from fetch_hand_sim.view.requests import Request
 from fetch_hand_sim.view.session import Perform, Requests, Session
 from fetch_hand_sim.view.web import FrameRate, announce, open_page
 from msgs_spec.tasks import TaskSpec
@@ -68,7 +68,7 @@ def _run(options: argparse.Namespace, stop: StopSignals) -> None:
             return
         _give_way()
         announce(address, options.browser)
-        session = Session(handle, robot)
+        session = Session(handle, robot.picture)
         while not stop and all(process.poll() is None for process in nodes.values()):
             if attendance.has_left():
                 robot.leave()
@@ -84,7 +84,7 @@ def attended(robot: LiveRobot, attendance: Attendance) -> Perform:
     An absent visitor's page is still drawn, and repeats the requests of held buttons.
     """
 
-    def perform(request: Request | LatestRequest) -> None:
+    def perform(request: Request) -> None:
         if attendance.is_there:
             robot.perform(request)
 

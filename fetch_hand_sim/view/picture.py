@@ -108,16 +108,12 @@ class Timeline:
     """Position of the playhead in a file, and of the file in its list.
 
     Attributes:
-        index: Frame shown, from 0.
-        frames: Number of frames.
         time: Seconds since the first frame.
         title: Name of the episode.
         number: Position in the list, from 0.
         count: Length of the list.
     """
 
-    index: int
-    frames: int
     time: float
     title: str
     number: int

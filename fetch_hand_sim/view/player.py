@@ -17,7 +17,6 @@ from fetch_hand_sim.view.page.page import Page
 from fetch_hand_sim.view.picture import ONLY_WATCHED, Facts, Picture, Timeline
 from fetch_hand_sim.view.requests import (
     ChangeEpisode,
-    LatestRequest,
     OpenEpisode,
     Request,
     Seek,
@@ -55,7 +54,7 @@ def run_files(options: argparse.Namespace) -> int:
     with handle:
         if not stop:
             announce(address, options.browser)
-        session = Session(handle, player)
+        session = Session(handle, player.picture)
         while not stop:
             session.update()
             time.sleep(_FRAME_TIME)
@@ -108,7 +107,7 @@ class Player:
         self._shown = now
         return self._make_picture()
 
-    def perform(self, request: Request | LatestRequest) -> None:
+    def perform(self, request: Request) -> None:
         """Perform a request, unless the page may only watch."""
         if not self._may_act:
             self._notice = ONLY_WATCHED
@@ -124,10 +123,11 @@ class Player:
             case Seek():
                 self._is_paused = True
                 self._show(request.index)
-            case ChangeEpisode():
-                self._change(request.by)
-            case OpenEpisode():
-                self._choose(request.number)
+            case ChangeEpisode(by=by):
+                count = len(self._paths)
+                self._change([(self._number + by * i) % count for i in range(1, count + 1)])
+            case OpenEpisode(number=number) if 0 <= number < len(self._paths):
+                self._change([number])
 
     def _set_paused(self, is_paused: bool) -> None:
         self._is_paused = is_paused
@@ -138,21 +138,12 @@ class Player:
         last = len(self._recording.frames) - 1
         self._position = float(self._recording.times[min(max(index, 0), last)])
 
-    def _change(self, by: int) -> None:
-        """Open the next readable episode. Without one, stay and set a notice."""
-        count = len(self._paths)
+    def _change(self, numbers: Sequence[int]) -> None:
+        """Open the first readable episode of these. Without one, stay and set a notice."""
         try:
-            self._open_first([(self._number + by * each) % count for each in range(1, count + 1)])
+            self._open_first(numbers)
         except EpisodeReadError as error:
-            self._notice = f'no episode can be read any more; {error}'
-
-    def _choose(self, number: int) -> None:
-        """Open an episode. If it is unreadable, stay and set a notice."""
-        if 0 <= number < len(self._paths):
-            try:
-                self._open(number)
-            except EpisodeReadError as error:
-                self._notice = str(error)
+            self._notice = str(error)
 
     def _open_first(self, numbers: Sequence[int]) -> None:
         """Open the first readable episode of these."""
@@ -192,18 +183,16 @@ class Player:
 
     def _make_picture(self) -> Picture:
         recording, index = self._recording, self.index
-        frames, arrays = recording.frames, recording.arrays
+        arrays = recording.arrays
         time = float(recording.times[index])
         return Picture(
             task=recording.spec.name,
-            frame=frames[index],
-            trail=tuple(trail_of(frames, index)),
+            frame=recording.frames[index],
+            trail=tuple(trail_of(recording.frames, index)),
             facts=self._facts(index),
             graphs=self._graphs.until(time),
             command=arrays.commands[index - 1] if index else None,
             timeline=Timeline(
-                index=index,
-                frames=len(frames),
                 time=time,
                 title=recording.title,
                 number=self._number,

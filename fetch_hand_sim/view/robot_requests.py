@@ -13,7 +13,6 @@ from rclpy.node import Node
 from fetch_hand_sim.episodes.runner import bounded_wrench
 from fetch_hand_sim.view.requests import (
     ChooseActor,
-    LatestRequest,
     Push,
     ReleaseGoal,
     Request,
@@ -216,7 +215,7 @@ class RobotRequests:
             shipped = self._spec.name
             self._policy.get_parameter('policy', lambda name: self._tell(actor=name or shipped))
 
-    def perform(self, request: Request | LatestRequest) -> None:
+    def perform(self, request: Request) -> None:
         """Perform a request; requests about files are ignored."""
         if self._spec is None or not self.fits(request):
             return
@@ -262,7 +261,7 @@ class RobotRequests:
                 taken = partial(self._tell, speed=factor, notice=f'{name}: {factor:g}')
                 self._time.set_parameter(name, factor, taken)
 
-    def fits(self, request: Request | LatestRequest) -> bool:
+    def fits(self, request: Request) -> bool:
         """Return whether a goal or command has the size that the current robot needs."""
         if self._spec is None or not isinstance(request, SetGoal | SetCommand):
             return True

@@ -3,89 +3,61 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Protocol
 
 from mujoco.studio import messages, plugin, viewer_handle
 
 from fetch_hand_sim.simulation.scene import Scene
 from fetch_hand_sim.view.page.body_drag import pulls
 from fetch_hand_sim.view.picture import Picture, ShowScene
-from fetch_hand_sim.view.requests import LatestRequest, Push, Request
+from fetch_hand_sim.view.requests import Push, Request
 from msgs_spec.text import one_line
 from node_runtime.command_line import CommandError
 
-Perform = Callable[[Request | LatestRequest], None]
+Perform = Callable[[Request], None]
 
 
-class Source(Protocol):
-    """A running robot or an episode file."""
-
-    def picture(self) -> Picture | None:
-        """Return what to show if it has changed since the last call."""
-
-    def perform(self, request: Request | LatestRequest) -> None:
-        """Perform a request."""
+# Messages of the viewer's own tools, which would change the model that is shown.
+_DROPPED = (
+    messages.StateEvent,
+    messages.LoadModelEvent,
+    messages.ResetEvent,
+    messages.MjOptionSnapshot,
+)
 
 
 class Requests(plugin.SimPlugin):
-    """Passes the requests of the page to a source.
-
-    The viewer's own tools would change the model that is shown. Of their messages, only pulls at
-    bodies are passed on; the others are dropped.
-
-    Args:
-        perform: Called with each request.
-    """
+    """Calls `perform` with each request of the page, and with pulls at bodies."""
 
     def __init__(self, perform: Perform) -> None:
         self._perform = perform
 
     @messages.handler
-    def on_request(self, request: Request) -> bool:
-        """Pass on a request."""
-        self._perform(request)
-        return True
-
-    @messages.handler
-    def on_latest(self, request: LatestRequest) -> bool:
-        """Pass on a request."""
-        self._perform(request)
-        return True
-
-    @messages.handler
-    def on_perturb(self, event: messages.PerturbSnapshot) -> bool:
-        """Pass on pulls at bodies."""
-        for body, wrench in pulls(self.handle.model, event):
-            self._perform(Push(body, wrench))
-        return True
-
-    @messages.handler
-    def on_state(self, event: messages.StateEvent) -> bool:
-        """Drop the event."""
-        return True
-
-    @messages.handler
-    def on_load(self, event: messages.LoadModelEvent) -> bool:
-        """Drop the event."""
-        return True
-
-    @messages.handler
-    def on_reset(self, event: messages.ResetEvent) -> bool:
-        """Drop the event."""
-        return True
-
-    @messages.handler
-    def on_option(self, event: messages.MjOptionSnapshot) -> bool:
-        """Drop the event."""
+    def on_message(self, message: messages.Message) -> bool:
+        """Pass on a request; return True for messages that the viewer must not handle itself."""
+        match message:
+            case Request():
+                self._perform(message)
+            case messages.PerturbSnapshot():
+                for body, wrench in pulls(self.handle.model, message):
+                    self._perform(Push(body, wrench))
+            case _:
+                return isinstance(message, _DROPPED)
         return True
 
 
 class Session:
-    """One page and its source."""
+    """One page and its source.
 
-    def __init__(self, handle: viewer_handle.ViewerHandle, source: Source) -> None:
+    Args:
+        handle: The viewer that shows the page.
+        picture: Returns what to show if it has changed since the last call.
+    """
+
+    def __init__(
+        self, handle: viewer_handle.ViewerHandle, picture: Callable[[], Picture | None]
+    ) -> None:
         self._handle = handle
-        self._source = source
+        self._picture = picture
         self._scene: Scene | None = None
 
     def update(self) -> bool:
@@ -95,7 +67,7 @@ class Session:
             Exception: The error that ended the viewer's thread.
         """
         self._handle.is_running()
-        picture = self._source.picture()
+        picture = self._picture()
         if picture is not None:
             self._show(picture)
         self._handle.sync()

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import mujoco
 import numpy as np
-from mujoco.studio import messages, ux
+from mujoco.studio import messages, ux, viewer_protocol
 
 from fetch_hand_sim.simulation.scene import GHOST
 from fetch_hand_sim.view.page.ray import Ray
@@ -48,62 +48,53 @@ def pulls(model: mujoco.MjModel, snapshot: messages.PerturbSnapshot) -> list[tup
 
 
 class BodyDrag:
-    """A spring between the mouse and a body; changes the perturbation that the viewer draws."""
+    """A spring between the mouse and a body; changes the perturbation that a viewer draws."""
 
-    def __init__(self, perturb: mujoco.MjvPerturb) -> None:
-        self._perturb = perturb
+    def __init__(self, viewer: viewer_protocol.Viewer) -> None:
+        self._viewer = viewer
 
     @property
     def is_pulling(self) -> bool:
         """True while the mouse holds a body."""
-        return bool(self._perturb.active)
+        return bool(self._viewer.perturb.active)
 
-    def begin(
-        self,
-        model: mujoco.MjModel,
-        data: mujoco.MjData,
-        camera: mujoco.MjvCamera,
-        options: mujoco.MjvOption,
-        ray: Ray,
-        limit: float,
-    ) -> bool:
-        """Grab the body under the mouse; return False if no body there can move.
+    def begin(self, ray: Ray, limit: float) -> bool:
+        """Grab the body under the mouse with a force of at most `limit`, N.
 
-        `limit` is the largest force, N. `options` selects the geoms that are drawn.
+        Returns False if no body there can move.
         """
-        body, point = _body_under(model, data, options, ray)
+        viewer, perturb = self._viewer, self._viewer.perturb
+        model, data = viewer.model, viewer.data
+        body, point = _body_under(model, data, viewer.vis_options, ray)
         if not can_be_pulled(model, body):
             return False
-        perturb = self._perturb
         perturb.select, perturb.flexselect, perturb.skinselect = body, -1, -1
         perturb.localpos = data.xmat[body].reshape(3, 3).T @ (point - data.xpos[body])
-        ux.InitPerturb(model, data, camera, perturb, _TRANSLATE)
+        ux.InitPerturb(model, data, viewer.camera, perturb, _TRANSLATE)
         perturb.active = _TRANSLATE
         # The force reaches the limit at the same length for every mass.
-        perturb.localmass = limit / (model.vis.map.stiffness * _REACH * camera.distance)
+        reach = _REACH * viewer.camera.distance
+        perturb.localmass = limit / (model.vis.map.stiffness * reach)
         return True
 
-    def move(
-        self,
-        model: mujoco.MjModel,
-        data: mujoco.MjData,
-        camera: mujoco.MjvCamera,
-        delta: Sequence[float],
-    ) -> messages.PerturbSnapshot:
+    def move(self, delta: Sequence[float]) -> messages.PerturbSnapshot:
         """Follow the mouse and return the forces, which are also written into `data` to draw them.
 
         `delta` (2,) is the movement since the last call, in widths and heights of the picture.
         """
+        viewer, data = self._viewer, self._viewer.data
         if any(delta):
-            ux.MovePerturb(model, data, camera, self._perturb, _IN_THE_PICTURE, *delta)
+            ux.MovePerturb(
+                viewer.model, data, viewer.camera, viewer.perturb, _IN_THE_PICTURE, *delta
+            )
         data.xfrc_applied[:] = 0.0
-        mujoco.mjv_applyPerturbForce(model, data, self._perturb)
+        mujoco.mjv_applyPerturbForce(viewer.model, data, viewer.perturb)
         return messages.PerturbSnapshot(data.xfrc_applied.ravel().copy(), _FORCES)
 
-    def end(self, data: mujoco.MjData) -> None:
+    def end(self) -> None:
         """Release the body."""
-        self._perturb.active = self._perturb.select = 0
-        data.xfrc_applied[:] = 0.0
+        self._viewer.perturb.active = self._viewer.perturb.select = 0
+        self._viewer.data.xfrc_applied[:] = 0.0
 
 
 def _body_under(

@@ -17,7 +17,7 @@ from fetch_hand_sim.view.page.goal_drag import Handle, drag_hint, find_handle, m
 from fetch_hand_sim.view.page.panels import Panels
 from fetch_hand_sim.view.page.ray import MousePlace, Ray, mouse_ray
 from fetch_hand_sim.view.picture import Picture, ShowScene
-from fetch_hand_sim.view.requests import LatestRequest, Request, SetGoal
+from fetch_hand_sim.view.requests import Request, SetGoal
 from msgs_spec.arrays import Array
 
 
@@ -44,7 +44,7 @@ class Page(plugin.ViewerPlugin):
         self._goal_drag: _GoalDrag | None = None
         self._body_drag: BodyDrag | None = None
 
-    def _send(self, request: Request | LatestRequest) -> None:
+    def _send(self, request: Request) -> None:
         self.viewer.send_to_sim(request)
 
     @messages.handler
@@ -52,7 +52,7 @@ class Page(plugin.ViewerPlugin):
         """Set theme and rendering options."""
         ux.setup_theme(ux.GuiTheme.LIGHT)
         event.viewer.vis_options = make_options()
-        self._body_drag = BodyDrag(event.viewer.perturb)
+        self._body_drag = BodyDrag(event.viewer)
 
     @messages.handler
     def on_scene(self, event: ShowScene) -> None:
@@ -64,7 +64,7 @@ class Page(plugin.ViewerPlugin):
         """Set the camera of the task."""
         del event
         if self._body_drag is not None:
-            self._body_drag.end(self.viewer.data)
+            self._body_drag.end()
         if self._scene is not None:
             self._scene.view.apply(self.viewer.camera)
 
@@ -119,22 +119,18 @@ class Page(plugin.ViewerPlugin):
             if not imgui.GetIO().KeyCtrl:
                 self._offer_goal(scene, picture.frame, place)
             elif picture.facts.push_limit and imgui.IsMouseClicked(imgui.MouseButton.Left):
-                self._take_body(body_drag, place, picture.facts.push_limit)
-
-    def _take_body(self, drag: BodyDrag, place: MousePlace, limit: float) -> None:
-        viewer, ray = self.viewer, self._ray(place)
-        if drag.begin(viewer.model, viewer.data, viewer.camera, viewer.vis_options, ray, limit):
-            imgui.SetNextFrameWantCaptureMouse(True)
+                if body_drag.begin(self._ray(place), picture.facts.push_limit):
+                    imgui.SetNextFrameWantCaptureMouse(True)
 
     def _pull(self, drag: BodyDrag) -> None:
-        viewer, io = self.viewer, imgui.GetIO()
+        io = imgui.GetIO()
         if not imgui.IsMouseDown(imgui.MouseButton.Left):
-            drag.end(viewer.data)
+            drag.end()
             return
         # Without this the browser turns the camera.
         imgui.SetNextFrameWantCaptureMouse(True)
         delta = (io.MouseDelta.x / io.DisplaySize.x, io.MouseDelta.y / io.DisplaySize.y)
-        viewer.send_to_sim(drag.move(viewer.model, viewer.data, viewer.camera, delta))
+        self.viewer.send_to_sim(drag.move(delta))
 
     def _offer_goal(self, scene: Scene, frame: Frame, place: MousePlace) -> None:
         handle = find_handle(scene.spec, frame.desired_goal, self._ray(place))

@@ -164,8 +164,7 @@ def draw_timeline(timeline: Timeline, facts: Facts, send: Send) -> None:
     where = f'{timeline.time:.2f} s   {timeline.title} ({timeline.number + 1} of {timeline.count})'
     imgui.Text(where)
     imgui.SetNextItemWidth(-1.0)
-    last = timeline.frames - 1
-    moved, index = imgui.SliderInt('##timeline', timeline.index, 0, last, 'frame %d')
+    moved, index = imgui.SliderInt('##timeline', facts.tick, 0, facts.ticks, 'frame %d')
     if moved:
         send(Seek(index))
     imgui.EndDisabled()

@@ -8,9 +8,9 @@ from contextlib import contextmanager
 
 from mujoco.studio.dear_imgui import dear_imgui as imgui
 
-from fetch_hand_sim.view.requests import LatestRequest, Request, SetPaused, SetSpeed, StepOnce
+from fetch_hand_sim.view.requests import Request, SetPaused, SetSpeed, StepOnce
 
-Send = Callable[[Request | LatestRequest], None]
+Send = Callable[[Request], None]
 
 # Pixels. Items leave room for their names.
 MARGIN = 10.0

@@ -35,8 +35,8 @@ class Window:
         mujoco.mj_forward(self.model, self.data)
         self.camera = mujoco.MjvCamera()
         self.scene.view.apply(self.camera)
-        self.perturb = mujoco.MjvPerturb()
-        self.drag = BodyDrag(self.perturb)
+        self.perturb, self.vis_options = mujoco.MjvPerturb(), make_options()
+        self.drag = BodyDrag(self)
 
     def ray_at(self, point):
         center = mouse_ray(self.scene.view, 45.0, MousePlace(0.5, 0.5, ASPECT))
@@ -44,11 +44,7 @@ class Window:
         return dataclasses.replace(center, direction=toward / np.linalg.norm(toward))
 
     def begin_at(self, point):
-        options, ray = make_options(), self.ray_at(point)
-        return self.drag.begin(self.model, self.data, self.camera, options, ray, LIMIT)
-
-    def move(self, *delta):
-        return self.drag.move(self.model, self.data, self.camera, delta)
+        return self.drag.begin(self.ray_at(point), LIMIT)
 
 
 @pytest.mark.parametrize('task', ['FetchPush', 'FetchSlide', 'HandManipulateBlockFull'])
@@ -56,14 +52,14 @@ def test_the_object_is_taken_where_it_is_seen_and_follows_the_mouse(task):
     window = Window(task)
     assert window.begin_at(window.data.body(TASKS[task].object_name).xpos)
     assert window.drag.is_pulling
-    ((body, still),) = pulls(window.model, window.move(0.0, 0.0)) or (('', np.zeros(6)),)
+    ((body, still),) = pulls(window.model, window.drag.move((0.0, 0.0))) or (('', np.zeros(6)),)
     assert body in ('', TASKS[task].object_name) and np.abs(still).max() < 1e-6
-    ((body, wrench),) = pulls(window.model, window.move(0.0, -0.02))
+    ((body, wrench),) = pulls(window.model, window.drag.move((0.0, -0.02)))
     assert body == TASKS[task].object_name
     assert wrench[2] > 0.0 and wrench[2] > 0.5 * np.linalg.norm(wrench[:3])
-    ((_, harder),) = pulls(window.model, window.move(0.0, -0.02))
+    ((_, harder),) = pulls(window.model, window.drag.move((0.0, -0.02)))
     assert np.linalg.norm(harder[:3]) > 1.5 * np.linalg.norm(wrench[:3])
-    window.drag.end(window.data)
+    window.drag.end()
     assert not window.drag.is_pulling and not window.data.xfrc_applied.any()
 
 
@@ -77,7 +73,7 @@ def test_the_pull_reaches_the_limit_a_tenth_of_the_view_away(task):
     for _ in range(40):
         # The picture is as high as what is seen of the world at that distance.
         total += 0.01
-        ((_, wrench),) = pulls(window.model, window.move(0.0, -0.01))
+        ((_, wrench),) = pulls(window.model, window.drag.move((0.0, -0.01)))
         if np.linalg.norm(wrench[:3]) >= LIMIT:
             break
     assert total * 2.0 * np.tan(np.radians(22.5)) == pytest.approx(0.1, rel=0.4)
@@ -120,7 +116,7 @@ def test_the_viewers_message_becomes_a_push():
     state = np.zeros((scene.model.nbody, 6))
     state[scene.model.body('object0').id] = [1.0, 2.0, 3.0, 0.1, 0.2, 0.3]
     forces = mujoco.mjtState.mjSTATE_XFRC_APPLIED.value
-    assert requests.on_perturb(messages.PerturbSnapshot(state.ravel(), forces))
+    assert requests.on_message(messages.PerturbSnapshot(state.ravel(), forces))
     (push,) = asked
     assert isinstance(push, Push) and push.body == 'object0'
     np.testing.assert_array_equal(push.wrench, [1.0, 2.0, 3.0, 0.1, 0.2, 0.3])

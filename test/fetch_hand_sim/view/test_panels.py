@@ -17,7 +17,7 @@ from support.episode_recorder import Recorder
 
 HEIGHT = 180.0
 EPISODES = (Path('a'), Path('b'))
-TIMELINE = Timeline(index=0, frames=1, time=0.0, title='a', number=0, count=2)
+TIMELINE = Timeline(time=0.0, title='a', number=0, count=2)
 
 
 class Drawn(Windows):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import shutil
 
 import numpy as np
@@ -76,30 +75,30 @@ def test_frames_are_what_was_logged(task, tmp_path):
 
 
 def test_it_plays_as_fast_as_asked(player, clock):
-    assert player.picture().timeline.index == 0
+    assert player.picture().facts.tick == 0
     clock.now = 0.4
-    assert player.picture().timeline.index == 10
+    assert player.picture().facts.tick == 10
     assert player.picture() is None, 'nothing new'
     player.perform(SetSpeed(2.0))
     clock.now = 0.6
-    assert player.picture().timeline.index == 20
+    assert player.picture().facts.tick == 20
     player.perform(SetSpeed(1.0))
     clock.now = 2.0
-    assert player.picture().timeline.index == 50
+    assert player.picture().facts.tick == 50
     clock.now = 3.2
-    assert player.picture().timeline.index == 0, 'it starts again after the end'
+    assert player.picture().facts.tick == 0, 'it starts again after the end'
 
 
 def test_pause_steps_and_seeking(player, clock):
     player.perform(SetPaused(True))
     clock.now = 5.0
-    assert player.picture().timeline.index == 0
+    assert player.picture().facts.tick == 0
     player.perform(StepOnce())
-    assert player.picture().timeline.index == 1
+    assert player.picture().facts.tick == 1
     player.perform(Seek(40))
-    assert player.picture().timeline.index == 40
+    assert player.picture().facts.tick == 40
     player.perform(StepOnce(-1))
-    assert player.picture().timeline.index == 39
+    assert player.picture().facts.tick == 39
     for beyond, end in ((-5, 0), (10**9, 50)):
         player.perform(Seek(beyond))
         assert player.index == end
@@ -122,7 +121,7 @@ def test_a_read_only_page_plays_on(folder, clock):
         player.perform(request)
     clock.now += 0.4
     picture = player.picture()
-    assert (picture.timeline.number, picture.timeline.index) == (0, 10)
+    assert (picture.timeline.number, picture.facts.tick) == (0, 10)
     assert not picture.facts.may_command and '--read-only' in picture.facts.notice
 
 
@@ -145,7 +144,7 @@ def test_episodes_that_are_gone_are_said_to_be(folder, tmp_path, clock):
     player.perform(ChangeEpisode(1))
     picture = player.picture()
     assert picture.timeline.number == 0
-    assert 'no episode can be read any more' in picture.facts.notice
+    assert 'none of 3 episodes can be read' in picture.facts.notice
     assert 'No such file' in picture.facts.notice
 
 
@@ -184,7 +183,7 @@ def test_curves_end_at_the_playhead(player):
     graphs = picture.graphs
     for series in (graphs.distance, graphs.reward, graphs.commands):
         assert len(series.times) == len(series.values) == 11
-    assert dataclasses.asdict(picture.timeline)['frames'] == 51
+    assert picture.facts.ticks == 50
 
 
 def test_fingers_are_comparable_with_the_command_of_the_gripper():
