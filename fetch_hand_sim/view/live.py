@@ -122,7 +122,7 @@ class LiveRobot:
         if request == SetCommanding(True) and self._facts.is_silent:
             self._update_facts(notice='the robot is silent: the sliders cannot command it')
             return
-        self._requests.perform(request)
+        self._requests.perform(request, self._facts)
         history, is_replay = self._history, self._facts.is_replay
         is_goal = isinstance(request, SetGoal) and self._requests.fits(request)
         if is_goal and history is not None and not is_replay:
@@ -136,7 +136,7 @@ class LiveRobot:
 
     def _stop_commanding(self, notice: str) -> None:
         if self._facts.is_commanding:
-            self._requests.perform(SetCommanding(False))
+            self._requests.perform(SetCommanding(False), self._facts)
             self._update_facts(notice=notice)
 
     def _notice_other_robot(self) -> None:
@@ -241,7 +241,6 @@ class LiveRobot:
         self._hear()
         self._asked_rate = None
         self._unread.add('speed')
-        self._requests.push_limit = 0.0
         self._update_facts(
             is_paused=self._replays.stands_still(self._facts.is_paused),
             rate=self._replays.rate,
@@ -264,13 +263,12 @@ class LiveRobot:
             # The report rounds the speed, and leaves it out while paused or in lockstep.
             self._asked_rate = asked
             self._unread.add('speed')
-        self._requests.push_limit = _number(values.get(PERTURB_LIMIT))
         self._update_facts(
             is_paused=values.get(PAUSED) == 'True',
             rate=_number(values.get(RATE)),
             missed_ticks=int(_number(values.get(MISSED_TICKS))),
             commander=values.get(COMMANDERS, '-'),
-            push_limit=self._requests.push_limit,
+            push_limit=_number(values.get(PERTURB_LIMIT)),
             has_speed=values.get(MODE) != 'lockstep',
         )
         self._yield_to_others()

@@ -39,7 +39,7 @@ def run_files(options: argparse.Namespace) -> int:
 
     Raises:
         UsageError: If no episode can be played.
-        CannotServe: If the page cannot be served.
+        CommandError: If the page cannot be served.
     """
     stop = StopSignals()
     try:

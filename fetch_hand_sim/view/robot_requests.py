@@ -11,6 +11,7 @@ import numpy as np
 from rclpy.node import Node
 
 from fetch_hand_sim.episodes.runner import bounded_wrench
+from fetch_hand_sim.view.picture import Facts
 from fetch_hand_sim.view.requests import (
     ChooseActor,
     Push,
@@ -153,9 +154,6 @@ class RobotRequests:
     Args:
         node: The node of this process.
         tell: Called with changed fields of `Facts`, by name.
-
-    Attributes:
-        push_limit: Largest force that the robot accepts, N; 0 for none.
     """
 
     def __init__(self, node: Node, tell: Callable[..., None]) -> None:
@@ -165,8 +163,6 @@ class RobotRequests:
         self._policy = RemoteNode(node, 'policy_node', self._notice)
         self._replay: tuple[Replay, RemoteNode] | None = None
         self._spec: TaskSpec | None = None
-        self.push_limit = 0.0
-        self._is_commanding = False
         self._kept_goal: Array | None = None
         self._asked_goal: tuple[float, Array] | None = None
         self._publishers: dict[str, Any] = {}
@@ -183,7 +179,6 @@ class RobotRequests:
             # Goals of another task may have another type.
             for name in list(self._publishers):
                 self._withdraw(name)
-            self._is_commanding = False
             self._tell(is_commanding=False)
         self._spec = spec
 
@@ -215,8 +210,8 @@ class RobotRequests:
             shipped = self._spec.name
             self._policy.get_parameter('policy', lambda name: self._tell(actor=name or shipped))
 
-    def perform(self, request: Request) -> None:
-        """Perform a request; requests about files are ignored."""
+    def perform(self, request: Request, facts: Facts) -> None:
+        """Perform a request to a robot in this state; requests about files are ignored."""
         if self._spec is None or not self.fits(request):
             return
         if self._replay is not None and not isinstance(request, _OF_A_REPLAY):
@@ -236,10 +231,10 @@ class RobotRequests:
                 self._notice('the next episode draws its own goal')
             case SetCommanding():
                 self._set_commanding(request.is_commanding)
-            case SetCommand() if self._is_commanding:
+            case SetCommand() if facts.is_commanding:
                 self._publish('commands', request.values)
             case Push():
-                self._push(request)
+                self._push(request, facts.push_limit)
 
     def _control_time(self, request: SetPaused | StepOnce | Reset | SetSpeed) -> None:
         match request:
@@ -287,18 +282,17 @@ class RobotRequests:
         return 'real_time_factor' if self._replay is None else 'rate'
 
     def _set_commanding(self, is_commanding: bool) -> None:
-        self._is_commanding = is_commanding
         self._tell(is_commanding=is_commanding)
         if not is_commanding:
             self._withdraw('commands')
 
-    def _push(self, request: Push) -> None:
+    def _push(self, request: Push, limit: float) -> None:
         assert self._spec is not None
-        if not self.push_limit:
+        if not limit:
             self._notice('pushes are off; start the robot with perturb_limit:=10.0 (N)')
             return
         target = topic(self._spec, 'perturb')
-        wrench = bounded_wrench(request.wrench, self.push_limit)
+        wrench = bounded_wrench(request.wrench, limit)
         message = build_message(target, 0, wrench)
         message.header.frame_id = request.body
         self._send('perturb', serialize(target.type_name, message))

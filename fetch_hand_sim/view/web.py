@@ -50,10 +50,6 @@ _START_TIMEOUT = 10.0
 _SET_TIMER_SLACK, _SLACK_NS = 29, 5_000_000
 
 
-class CannotServe(CommandError):
-    """The page cannot be served; the message is one line."""
-
-
 @dataclass(frozen=True, slots=True)
 class Address:
     """Address of the page; `token` is None if the page is local."""
@@ -123,14 +119,13 @@ class FrameRate:
 
 
 class _Viewer(web_viewer.WebViewer):
-    """The web viewer without files from visitors; `frame_rate` None means 60 frames a second."""
+    """The web viewer without files from visitors."""
 
-    frame_rate: FrameRate | None = None
+    frame_rate: FrameRate
 
     def prepare_next_frame(self) -> bool:
         """Wait for the next frame and begin it."""
-        if self.frame_rate is not None:
-            time.sleep(self.frame_rate.wait_time(time.monotonic(), _read_touch()))
+        time.sleep(self.frame_rate.wait_time(time.monotonic(), _read_touch()))
         begun: bool = super().prepare_next_frame()
         return begun
 
@@ -188,7 +183,7 @@ def open_page(
     host: str,
     port: int,
     plugins: Sequence[plugin.Plugin],
-    frame_rate: FrameRate | None = None,
+    frame_rate: FrameRate,
     attendance: Attendance | None = None,
     is_read_only: bool = False,
 ) -> tuple[viewer_handle.ViewerHandle, Address]:
@@ -198,12 +193,12 @@ def open_page(
         host: Interface to listen on.
         port: A port, or 0 for the first free one from 8080.
         plugins: Plugins of the page and of the robot's side.
-        frame_rate: When to build frames; None means 60 times a second.
+        frame_rate: When to build frames.
         attendance: Records whether a visitor is at the page in control.
         is_read_only: Whether the page cannot act, for the warning.
 
     Raises:
-        CannotServe: If the port is taken, or the host is no address of this machine.
+        CommandError: If the port is taken, or the host is no address of this machine.
     """
     listening = _listen(host, port)
     port = listening.getsockname()[1]
@@ -261,7 +256,7 @@ def _listen(host: str, port: int) -> socket.socket:
     """Return a listening socket on `port`, or on the first free port for 0.
 
     Raises:
-        CannotServe: If the host is no address of this machine, or no port is free.
+        CommandError: If the host is no address of this machine, or no port is free.
     """
     reason = ''
     for each in [port] if port else _PORTS:
@@ -273,9 +268,9 @@ def _listen(host: str, port: int) -> socket.socket:
             reason = getattr(error, 'strerror', None) or str(error)
             if getattr(error, 'errno', None) not in (errno.EADDRINUSE, errno.EACCES):
                 line = f'cannot listen on {host}: no address of this machine ({reason})'
-                raise CannotServe(line) from None
+                raise CommandError(line) from None
     wanted = port or f'{_PORTS[0]} ... {_PORTS[-1]}'
-    raise CannotServe(f'cannot listen on {host} port {wanted}: {reason}')
+    raise CommandError(f'cannot listen on {host} port {wanted}: {reason}')
 
 
 def _check_guarded(address: Address) -> None:
@@ -289,13 +284,13 @@ def _check_guarded(address: Address) -> None:
             status = connection.getresponse().status
         except OSError as error:
             if time.monotonic() > deadline:
-                raise CannotServe(f'the page does not answer: {error}') from None
+                raise CommandError(f'the page does not answer: {error}') from None
             time.sleep(0.05)
             continue
         finally:
             connection.close()
         if status != 403:
-            raise CannotServe(
+            raise CommandError(
                 f'mujoco.studio does not use the guard (status {status}). '
                 'Install the version of mujoco that setup.py names.'
             )

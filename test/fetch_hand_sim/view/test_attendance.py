@@ -71,67 +71,54 @@ def test_the_page_in_control_is_heard_and_a_hanging_one_is_left_in_time(path, mo
 
 
 @pytest.fixture
-def robot():
-    rclpy.init()
-    node = rclpy.create_node('page')
-    yield LiveRobot(node, may_command=True)
-    node.destroy_node()
-    rclpy.try_shutdown()
+def robot(node):
+    return LiveRobot(node, may_command=True)
 
 
-def status(**changes):
+def follow(robot, stamps=(), **changes):
+    """Show a status and ticks with these stamps to a page."""
     fields = {'task': 'FetchReach', 'episode': 0, 'seed': 0, 'tick': 0, 'phase': 'reset'}
     fields |= {'control_hz': 25.0, 'reward_type': 'sparse', 'success_rule': 'gymnasium'}
-    return EpisodeStatus(**fields | {'episode_return': 0.0, 'is_success': False} | changes)
-
-
-def follow(robot, said, stamps=()):
-    """Lets a page see a robot without one."""
-    robot._watch.status = said
-    robot._on_status(said)
+    status = EpisodeStatus(**fields | {'episode_return': 0.0, 'is_success': False} | changes)
+    robot._watch.status = status
+    robot._on_status(status)
     for stamp in stamps:
         goal = np.array([1.3, 0.7, 0.5])
         frame = Frame(np.zeros(15), goal, goal, None, is_success=True)
         robot._on_tick(SeenTick(stamp, frame, -1.0, np.zeros(4), None))
 
 
-def test_commands_end_when_the_visitor_leaves(robot):
-    follow(robot, status(), [10])
-    robot.perform(SetCommanding(True))
-    assert robot.picture().facts.is_commanding
+def test_commands_end_when_visitor_task_or_robot_are_gone(robot, monkeypatch):
+    def facts_of_a_commander():
+        robot.perform(SetCommanding(True))
+        return robot.picture().facts
+
+    follow(robot, [10])
+    assert facts_of_a_commander().is_commanding
     robot.leave()
     facts = robot.picture().facts
     assert not facts.is_commanding and 'the visitor left' in facts.notice
     robot.leave()
     assert robot.picture() is None
-
-
-def test_commands_end_when_the_robot_has_another_task(robot):
-    follow(robot, status(), [10])
-    robot.perform(SetCommanding(True))
-    follow(robot, status(task='FetchPush', episode=3))
+    assert facts_of_a_commander().is_commanding
+    follow(robot, [20], task='FetchPush', episode=3)
     facts = robot.picture().facts
     assert not facts.is_commanding and 'restarted' in facts.notice
-
-
-def test_commands_end_when_the_robot_falls_silent(robot, monkeypatch):
-    follow(robot, status(), [10])
-    robot.perform(SetCommanding(True))
+    assert facts_of_a_commander().is_commanding
     monkeypatch.setattr(live, '_SILENCE', 0.0)
     robot._look()
     facts = robot.picture().facts
     assert facts.is_silent and not facts.is_commanding and 'silent' in facts.notice
-    robot.perform(SetCommanding(True))
-    assert not robot.picture().facts.is_commanding
+    assert not facts_of_a_commander().is_commanding
 
 
 def test_a_notice_ends_with_its_episode(robot, monkeypatch):
-    follow(robot, status(), [10])
+    follow(robot, [10])
     robot.perform(ReleaseGoal())
-    follow(robot, status(tick=3, phase='running'), [20])
+    follow(robot, [20], tick=3, phase='running')
     robot._look()
     assert 'draws its own goal' in robot.picture().facts.notice
-    follow(robot, status(episode=1), [30])
+    follow(robot, [30], episode=1)
     robot._look()
     assert robot.picture().facts.notice, 'time to read it'
     monkeypatch.setattr(live, '_NOTICE_TIME', 0.0)
@@ -139,51 +126,38 @@ def test_a_notice_ends_with_its_episode(robot, monkeypatch):
     assert robot.picture().facts.notice == ''
 
 
-def test_a_goal_is_seen_at_once_also_of_a_robot_that_stands_still(robot):
-    follow(robot, status(), [10])
-    robot.picture()
+def test_pictures_show_new_goals_at_once_and_nothing_of_an_earlier_robot(robot):
+    follow(robot, [10**9, 2 * 10**9, 3 * 10**9])
+    assert len(robot.picture().graphs.reward.times) == 3
+    # A robot that stands still publishes no tick with the goal.
     goal = np.array([1.4, 0.8, 0.6])
     robot.perform(SetGoal(goal))
     np.testing.assert_array_equal(robot.picture().frame.desired_goal, goal)
-
-
-def test_curves_begin_again_where_time_goes_back(robot):
-    follow(robot, status(), [10**9, 2 * 10**9, 3 * 10**9])
-    assert len(robot.picture().graphs.reward.times) == 3
-    follow(robot, status(episode=1), [10**9])
+    # Curves begin again where time goes back.
+    follow(robot, [10**9], episode=1)
     assert robot.picture().graphs.reward.times.tolist() == [1.0]
-
-
-def test_a_robot_that_waits_shows_nothing_of_the_one_before(robot):
-    follow(robot, status(), [10**9])
-    assert robot.picture().frame is not None
-    follow(robot, status(phase='waiting'))
+    follow(robot, phase='waiting')
     picture = robot.picture()
     assert picture.frame is None and picture.facts.phase == 'waiting'
 
 
-def test_a_node_that_hangs_is_asked_seldom(robot, monkeypatch):
-    del robot
-    node = rclpy.create_node('asks')
-    try:
-        asked = []
+def test_a_node_that_hangs_is_asked_seldom(node, monkeypatch):
+    asked = []
 
-        class Hanging:
-            def service_is_ready(self):
-                return True
+    class Hanging:
+        def service_is_ready(self):
+            return True
 
-            def call_async(self, request):
-                asked.append(request)
-                return rclpy.task.Future()
+        def call_async(self, request):
+            asked.extend(request.names)
+            return rclpy.task.Future()
 
-        remote = RemoteNode(node, 'sim_node', print)
-        monkeypatch.setattr(remote, '_client', lambda *_: Hanging())
-        for name in ('rate', 'rate', 'policy', 'rate'):
-            remote.get_parameter(name, print)
-        assert [request.names for request in asked] == [['rate'], ['policy']]
-        # Another one may be in its place by now.
-        monkeypatch.setattr(robot_requests, '_ANSWER_TIMEOUT', 0.0)
-        remote.get_parameter('rate', print)
-        assert [request.names for request in asked] == [['rate'], ['policy'], ['rate']]
-    finally:
-        node.destroy_node()
+    remote = RemoteNode(node, 'sim_node', print)
+    monkeypatch.setattr(remote, '_client', lambda *_: Hanging())
+    for name in ('rate', 'rate', 'policy', 'rate'):
+        remote.get_parameter(name, print)
+    assert asked == ['rate', 'policy']
+    # Another one may be in its place by now.
+    monkeypatch.setattr(robot_requests, '_ANSWER_TIMEOUT', 0.0)
+    remote.get_parameter('rate', print)
+    assert asked == ['rate', 'policy', 'rate']

@@ -15,24 +15,22 @@ from websockets.sync.client import connect
 from fetch_hand_sim.view.guard import Guard, is_loopback
 from fetch_hand_sim.view.page.page import Page
 from fetch_hand_sim.view.session import Requests
-from fetch_hand_sim.view.web import Address, CannotServe, open_page
+from fetch_hand_sim.view.web import Address, FrameRate, open_page
+from node_runtime.command_line import CommandError
 
 TOKEN = 'a-token'
 
 
-def refusal(guard, target, **headers):
-    return guard.refusal(target, Headers(list(headers.items())))
+def status(guard, target, *headers):
+    """The status of a rejected request; None if it is served."""
+    answer = guard.refusal(target, Headers(headers))
+    return answer and answer.status_code
 
 
 @pytest.mark.parametrize('host', ['localhost:8080', '127.0.0.1:8080', '[::1]:8080', 'LOCALHOST'])
 def test_this_machine_is_served(host):
-    assert refusal(Guard(), '/', Host=host) is None
-    assert refusal(Guard(), '/ui?sid=1', Host=host, Origin=f'http://{host}') is None
-
-
-@pytest.mark.parametrize('host', ['evil.example', '192.168.0.7:8080', 'localhost.evil.example', ''])
-def test_a_name_that_points_here_is_not(host):
-    assert refusal(Guard(), '/', Host=host).status_code == 403
+    assert status(Guard(), '/', ('Host', host)) is None
+    assert status(Guard(), '/ui?sid=1', ('Host', host), ('Origin', f'http://{host}')) is None
 
 
 @pytest.mark.parametrize('path', ['/ui', '/state', '/state?sid=1'])
@@ -41,27 +39,38 @@ def test_a_name_that_points_here_is_not(host):
 )
 @pytest.mark.parametrize('token', [None, TOKEN])
 def test_a_web_socket_of_another_site_is_refused(path, origin, token):
-    headers = {'Host': 'localhost:8080', 'Cookie': f'fetch_hand_sim_view_0={TOKEN}'}
+    headers = [('Host', 'localhost:8080'), ('Cookie', f'fetch_hand_sim_view_0={TOKEN}')]
     if origin is not None:
-        headers['Origin'] = origin
-    assert refusal(Guard(token), path, **headers).status_code == 403
+        headers.append(('Origin', origin))
+    assert status(Guard(token), path, *headers) == 403
 
 
-@pytest.mark.parametrize('headers', [[], [('Host', 'localhost'), ('Host', 'evil.example')]])
-def test_one_host_is_needed(headers):
-    assert Guard().refusal('/', Headers(headers)).status_code == 400
+LOCAL = ('Host', 'localhost')
 
 
-@pytest.mark.parametrize('token', [None, TOKEN])
-@pytest.mark.parametrize('target', ['//[', 'http://[::1/', '//a[b]c/?token=a-token'])
-def test_what_is_no_address_is_refused(target, token):
-    """A traceback on the terminal of the robot would be a visitor's to make."""
-    assert refusal(Guard(token), target, Host='localhost').status_code == 400
-
-
-def test_no_files_from_visitors():
-    headers = {'Host': 'localhost', 'Origin': 'http://localhost'}
-    assert refusal(Guard(), '/drop?sid=1', **headers).status_code == 403
+@pytest.mark.parametrize(
+    ('target', 'headers', 'expected'),
+    [
+        # Names that point here.
+        ('/', [('Host', 'evil.example')], 403),
+        ('/', [('Host', '192.168.0.7:8080')], 403),
+        ('/', [('Host', 'localhost.evil.example')], 403),
+        ('/', [('Host', '')], 403),
+        # One host is needed.
+        ('/', [], 400),
+        ('/', [LOCAL, ('Host', 'evil.example')], 400),
+        # A traceback on the terminal of the robot would be a visitor's to make.
+        ('//[', [LOCAL], 400),
+        ('http://[::1/', [LOCAL], 400),
+        ('//a[b]c/?token=a-token', [LOCAL], 400),
+        # No files from visitors.
+        ('/drop?sid=1', [LOCAL, ('Origin', 'http://localhost')], 403),
+    ],
+)
+def test_without_a_token_only_this_machine_is_served(target, headers, expected):
+    assert status(Guard(), target, *headers) == expected
+    if expected == 400:
+        assert status(Guard(TOKEN), target, *headers) == expected
 
 
 @pytest.mark.parametrize(
@@ -75,29 +84,22 @@ def test_no_files_from_visitors():
         ('/', 'other=a-token'),
     ],
 )
-def test_without_the_token_nobody_is_served(target, cookie):
-    assert refusal(Guard(TOKEN), target, Host='robot.example', Cookie=cookie).status_code == 403
+def test_without_the_token_no_visitor_is_served(target, cookie):
+    assert status(Guard(TOKEN), target, ('Host', 'robot.example'), ('Cookie', cookie)) == 403
     assert Guard(TOKEN).admission(target) is None
 
 
-def test_the_token_admits_and_leaves_the_address():
-    guard = Guard(TOKEN)
-    assert refusal(guard, f'/?token={TOKEN}', Host='robot.example') is None
-    cookie = guard.admission(f'/?token={TOKEN}')
-    assert 'HttpOnly' in cookie and 'SameSite=Lax' in cookie
-    assert refusal(guard, '/', Host='robot.example', Cookie=cookie.partition(';')[0]) is None
-
-
-def test_two_pages_of_one_host_know_their_visitors_apart():
+def test_the_token_admits_to_one_of_two_pages_of_a_host():
     """Browsers give all ports of a host the same cookies."""
+    host, jar = ('Host', 'robot.example'), SimpleCookie()
     guards = [Guard('one', 8080), Guard('two', 8081)]
-    admissions = [guard.admission(f'/?token={guard.token}') for guard in guards]
-    jar = SimpleCookie()
-    for each in admissions:
-        jar.load(each)
-    cookie = '; '.join(f'{name}={morsel.value}' for name, morsel in jar.items())
     for guard in guards:
-        assert refusal(guard, '/', Host='robot.example', Cookie=cookie) is None
+        assert status(guard, f'/?token={guard.token}', host) is None
+        admission = guard.admission(f'/?token={guard.token}')
+        assert 'HttpOnly' in admission and 'SameSite=Lax' in admission
+        jar.load(admission)
+    cookie = '; '.join(f'{name}={morsel.value}' for name, morsel in jar.items())
+    assert [status(guard, '/', host, ('Cookie', cookie)) for guard in guards] == [None, None]
 
 
 class Network:
@@ -166,7 +168,7 @@ def test_loopback_is_told_from_the_rest():
 @pytest.fixture(scope='module')
 def address():
     plugins = [Page(), Requests(lambda request: None)]
-    handle, address = open_page('127.0.0.1', 0, plugins, is_read_only=True)
+    handle, address = open_page('127.0.0.1', 0, plugins, FrameRate(), is_read_only=True)
     yield address
     handle.close()
 
@@ -212,11 +214,10 @@ def test_a_visitor_who_leaves_is_no_error(address, caplog, error, is_said):
     assert ('never retrieved' in caplog.text) == is_said
 
 
-def test_a_taken_port_is_one_line(address):
-    with pytest.raises(CannotServe, match=rf'cannot listen on 127.0.0.1 port {address.port}: '):
-        open_page('127.0.0.1', address.port, [Page()])
-
-
-def test_a_foreign_address_is_one_line():
-    with pytest.raises(CannotServe, match=r'cannot listen on 203\.0\.113\.1: no address of this'):
-        open_page('203.0.113.1', 0, [Page()])
+def test_a_taken_port_or_foreign_address_is_one_line(address):
+    for host, port, line in (
+        ('127.0.0.1', address.port, rf'cannot listen on 127.0.0.1 port {address.port}: '),
+        ('203.0.113.1', 0, r'cannot listen on 203\.0\.113\.1: no address of this'),
+    ):
+        with pytest.raises(CommandError, match=line):
+            open_page(host, port, [Page()], FrameRate())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -23,96 +24,78 @@ from fetch_hand_sim.view.robot_watch import Replay
 from msgs_spec.codecs import decode
 from msgs_spec.tasks import task_spec
 from msgs_spec.topics import topic
-from node_runtime.ros import rclpy_profile, ros_message_class
+from node_runtime.ros import subscribe
 
 SPEC = task_spec('FetchPush')
 WRENCH = np.array([30.0, 0.0, 40.0, 0.0, 0.0, 0.0])
 
 
 class Desk:
-    """The page's side and somebody who hears what it sends."""
+    """The page's side of a robot, and what the page is told."""
 
-    def __init__(self, name):
-        self.node = rclpy.create_node('page')
-        self.told = {}
-        self.requests = RobotRequests(self.node, self.told.update)
+    def __init__(self, node):
+        self.node, self.facts = node, Facts()
+        self.requests = RobotRequests(node, self.tell)
         self.requests.take_task(SPEC)
-        self.source, self.heard = topic(SPEC, name), []
-        self.node.create_subscription(
-            ros_message_class(self.source.type_name),
-            name,
-            self.heard.append,
-            rclpy_profile(self.source.qos),
-        )
 
-    def count_publishers(self):
-        return self.node.count_publishers(self.source.name)
+    def tell(self, **changes):
+        self.facts = replace(self.facts, **changes)
 
-    def wait_for_message(self):
+    def perform(self, *requests):
+        for request in requests:
+            self.requests.perform(request, self.facts)
+
+    def values_sent(self, name, *requests):
+        """Values of the first message on a topic, and the message."""
+        source, received = topic(SPEC, name), []
+        subscribe(self.node, source, received.append)
+        self.perform(*requests)
         end = time.monotonic() + 20.0
-        while not self.heard and time.monotonic() < end:
+        while not received:
+            assert time.monotonic() < end
             rclpy.spin_once(self.node, timeout_sec=0.1)
-        return self.heard[-1]
+        return decode(source, received[0]), received[0]
 
 
 @pytest.fixture
-def desk(request):
-    rclpy.init()
-    desk = Desk(request.param)
-    yield desk
-    desk.node.destroy_node()
-    rclpy.shutdown()
+def desk(node):
+    return Desk(node)
 
 
-@pytest.mark.parametrize('desk', ['perturb'], indirect=True)
-def test_nothing_is_pushed_where_the_robot_takes_none(desk):
-    desk.requests.perform(Push('object0', WRENCH))
-    assert desk.count_publishers() == 0
-    assert 'perturb_limit' in desk.told['notice']
-
-
-@pytest.mark.parametrize('desk', ['perturb'], indirect=True)
-def test_a_push_beyond_the_limit_leaves_within_it(desk):
-    desk.requests.push_limit = 10.0
-    desk.requests.perform(Push('object0', WRENCH))
-    message = desk.wait_for_message()
+def test_a_push_stays_within_the_limit_of_the_robot(desk):
+    desk.perform(Push('object0', WRENCH))
+    assert desk.node.count_publishers('/perturb') == 0
+    assert 'perturb_limit' in desk.facts.notice
+    desk.tell(push_limit=10.0)
+    sent, message = desk.values_sent('perturb', Push('object0', WRENCH))
     assert message.header.frame_id == 'object0'
-    sent = decode(desk.source, message)
     np.testing.assert_allclose(sent, 0.2 * WRENCH, rtol=1e-6)
     assert np.linalg.norm(sent[:3]) <= 10.0
 
 
-@pytest.mark.parametrize('desk', ['perturb'], indirect=True)
-def test_replays_that_come_and_go_leave_nothing_behind(desk):
+def test_sliders_command_only_while_they_are_switched_on(desk):
+    values = np.array([0.1, 0.2, 0.3, -1.0])
+    desk.perform(SetCommand(values))
+    assert desk.node.count_publishers('/commands') == 0
+    sent, _ = desk.values_sent('commands', SetCommanding(True), SetCommand(values))
+    np.testing.assert_array_equal(sent, values)
+    desk.perform(SetCommanding(False), SetCommand(values))
+    assert desk.node.count_publishers('/commands') == 0
+    assert not desk.facts.is_commanding
+
+
+def test_a_node_that_does_not_answer_is_not_paused_and_replays_leave_nothing_behind(desk):
+    desk.perform(SetPaused(True))
+    assert desk.facts == Facts(notice='sim_node does not answer')
+    desk.perform(SetSpeed(2.0))
+    assert desk.facts.speed == 1.0
     before = len(list(desk.node.clients))
     for number in range(3):
         desk.requests.take_replay(Replay(f'/replay{number}', f'/replay{number}/pause'))
-        desk.requests.perform(SetPaused(True))
+        desk.perform(SetPaused(True))
         assert len(list(desk.node.clients)) > before
     desk.requests.take_replay(None)
     assert len(list(desk.node.clients)) == before
-
-
-@pytest.mark.parametrize('desk', ['commands'], indirect=True)
-def test_sliders_command_only_while_they_are_switched_on(desk):
-    values = np.array([0.1, 0.2, 0.3, -1.0])
-    desk.requests.perform(SetCommand(values))
-    assert desk.count_publishers() == 0
-    desk.requests.perform(SetCommanding(True))
-    desk.requests.perform(SetCommand(values))
-    np.testing.assert_array_equal(decode(desk.source, desk.wait_for_message()), values)
-    desk.requests.perform(SetCommanding(False))
-    desk.requests.perform(SetCommand(values))
-    assert desk.count_publishers() == 0
-    assert desk.told['is_commanding'] is False
-
-
-@pytest.mark.parametrize('desk', ['perturb'], indirect=True)
-def test_who_does_not_answer_is_not_paused(desk):
-    desk.requests.perform(SetPaused(True))
-    assert desk.told == {'notice': 'sim_node does not answer'}
-    desk.requests.perform(SetSpeed(2.0))
-    assert 'speed' not in desk.told
 
 
 class Choice:

@@ -18,17 +18,20 @@ from msgs_spec.tasks import task_spec
 from msgs_spec.tick import TickEncoder
 from msgs_spec.topics import DIAGNOSTICS, topic
 from node_runtime.diagnostics import Report, encode_reports
-from node_runtime.ros import rclpy_profile, ros_message_class
+from node_runtime.ros import open_publisher, subscribe
 
 JOINTS = len(task_spec('FetchReach').robot.joints)
+REPORT = {'mode': 'real time', 'paused': 'False', 'rate (Hz)': '25.00', 'commanders': '/somebody'}
 
 
 class Robot:
     """Publishes ticks as `sim_node` does."""
 
-    def __init__(self, node, simulation, prefix, first_stamp_ns):
+    def __init__(self, node, task='FetchReach', prefix=JOINT_PREFIX, first_stamp_ns=0):
         self._node = node
-        self._runner = EpisodeRunner(simulation, joint_prefix=prefix, first_stamp_ns=first_stamp_ns)
+        self._runner = EpisodeRunner(
+            Simulation(task, num_threads=1), joint_prefix=prefix, first_stamp_ns=first_stamp_ns
+        )
         self._encoder = TickEncoder(self._runner.spec)
         self._publishers = {}
 
@@ -37,60 +40,65 @@ class Robot:
         tick = self._runner.advance(self._runner.resting_command() if command is None else command)
         for source, data in self._encoder.encode(tick, latched=tick.status.phase != 'running'):
             if source.name not in lost:
-                self._publisher(source).publish(data)
+                self._publish(source, data)
         return tick
 
-    def report(self, values):
-        """Says something of itself, as `sim_node` does every second."""
-        report = Report('/sim_node', 'FetchReach', values, '')
-        self._publisher(DIAGNOSTICS).publish(encode_reports(report))
+    def report(self, **changes):
+        """Publishes diagnostics, as `sim_node` does every second."""
+        report = Report('/sim_node', 'FetchReach', REPORT | changes, '')
+        self._publish(DIAGNOSTICS, encode_reports(report))
 
     def leave(self):
         for publisher in self._publishers.values():
             self._node.destroy_publisher(publisher)
 
-    def _publisher(self, source):
+    def _publish(self, source, data):
         if source.name not in self._publishers:
-            self._publishers[source.name] = self._node.create_publisher(
-                ros_message_class(source.type_name), source.name, rclpy_profile(source.qos)
-            )
-        return self._publishers[source.name]
+            self._publishers[source.name] = open_publisher(self._node, source)
+        self._publishers[source.name].publish(data)
+
+
+def act_until(node, act, condition, seconds=20.0):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end
+        act()
+        rclpy.spin_once(node, timeout_sec=0.02)
 
 
 @pytest.mark.parametrize('every_tick', [True, False])
 def test_a_robot_that_comes_back_with_other_joint_names_is_followed(node, every_tick):
-    simulation, seen = Simulation('FetchReach', num_threads=1), []
+    seen = []
     watch = RobotWatch(node, lambda status: None, seen.append, every_tick)
     for prefix, first_stamp_ns in ((JOINT_PREFIX, 0), ('rh_', 10**12)):
-        robot, sent = Robot(node, simulation, prefix, first_stamp_ns), {}
+        robot, sent = Robot(node, 'FetchReach', prefix, first_stamp_ns), {}
 
-        def is_shown(tick, sent=sent):
-            return np.array_equal(tick.frame.joint_position, sent.get(tick.stamp_ns))
-
-        deadline = time.monotonic() + 20.0
-        while not any(map(is_shown, seen)):
-            assert time.monotonic() < deadline, f'no tick of the robot with {prefix!r}'
+        def tick(robot=robot, sent=sent):
             tick = robot.tick()
             sent[tick.stamp_ns] = tick.readings['joint_states'][:JOINTS]
-            rclpy.spin_once(node, timeout_sec=0.02)
+
+        def is_shown(sent=sent):
+            return any(np.array_equal(t.frame.joint_position, sent.get(t.stamp_ns)) for t in seen)
+
+        act_until(node, tick, is_shown)
         assert watch.joint_prefix == prefix
         robot.leave()
 
 
 def test_a_tick_that_lost_its_first_message_does_not_pass_for_the_one_before(node):
     """State comes best effort: a viewer that gets no processor for a while loses some of it."""
-    simulation, seen = Simulation('FetchReach', num_threads=1), []
+    seen, sent = [], {}
     watch = RobotWatch(node, lambda status: None, seen.append)
-    robot, sent = Robot(node, simulation, JOINT_PREFIX, 0), {}
-    losses = [(), (), ('applied_command',), ('joint_states',), (), ('achieved_goal',)]
-    deadline = time.monotonic() + 20.0
-    while len(seen) < 40:
-        assert time.monotonic() < deadline, f'{len(seen)} ticks were seen'
-        for lost in losses:
+    robot = Robot(node)
+
+    def tick():
+        for lost in ((), (), ('applied_command',), ('joint_states',), (), ('achieved_goal',)):
             tick = robot.tick(np.array([1.0, 0.3, -0.2, 0.0]), lost)
             sent[tick.stamp_ns] = tick, lost
             for _ in range(12):
                 rclpy.spin_once(node, timeout_sec=0.002)
+
+    act_until(node, tick, lambda: len(seen) >= 40)
     assert watch.joint_prefix == JOINT_PREFIX
     for each in seen:
         tick, lost = sent[each.stamp_ns]
@@ -99,76 +107,54 @@ def test_a_tick_that_lost_its_first_message_does_not_pass_for_the_one_before(nod
         assert 'joint_states' not in lost and 'achieved_goal' not in lost
 
 
+class Page:
+    """A viewer of a robot with its latest picture."""
+
+    def __init__(self, node):
+        self.node, self.viewer = node, live.LiveRobot(node, may_command=True)
+        self.picture = None
+
+    def act_until(self, act, condition, seconds=20.0):
+        def holds():
+            self.picture = self.viewer.picture() or self.picture
+            return self.picture is not None and condition(self.picture)
+
+        act_until(self.node, act, holds, seconds)
+
+
 @pytest.mark.parametrize('task', ['FetchReach', 'FetchPush'])
 def test_commands_of_the_page_never_reach_the_next_robot(node, task):
-    first = Robot(node, Simulation('FetchReach', num_threads=1), JOINT_PREFIX, 0)
-    viewer = live.LiveRobot(node, may_command=True)
-
-    def wait_for(condition, act):
-        deadline, picture = time.monotonic() + 20.0, None
-        while picture is None or not condition(picture):
-            assert time.monotonic() < deadline
-            act()
-            rclpy.spin_once(node, timeout_sec=0.02)
-            picture = viewer.picture() or picture
-
-    wait_for(lambda picture: picture.frame is not None, first.tick)
-    viewer.perform(SetCommanding(True))
-    viewer.perform(SetCommand(np.ones(4)))
-    viewer.perform(SetGoal(np.array([1.3, 0.7, 0.5])))
+    first, page, goals = Robot(node), Page(node), []
+    page.act_until(first.tick, lambda picture: picture.frame is not None)
+    page.viewer.perform(SetCommanding(True))
+    page.viewer.perform(SetCommand(np.ones(4)))
+    page.viewer.perform(SetGoal(np.array([1.3, 0.7, 0.5])))
     assert node.count_publishers('/commands') == 1
     first.leave()
-    second = Robot(node, Simulation(task, num_threads=1), JOINT_PREFIX, 0)
+    second = Robot(node, task)
     second.tick()
-    viewer.perform(SetCommand(np.ones(4)))
+    page.viewer.perform(SetCommand(np.ones(4)))
     assert node.count_publishers('/commands') == 0
-    sent = []
-    source = topic(task_spec(task), 'set_goal')
-    node.create_subscription(
-        ros_message_class(source.type_name), 'set_goal', sent.append, rclpy_profile(source.qos)
-    )
-
-    def is_over(picture):
-        return picture.task == task and picture.facts.episode > 0
-
-    wait_for(is_over, second.tick)
-    assert not viewer.picture() or not viewer.picture().facts.is_commanding
-    assert not sent, 'the goal was kept for the first robot'
+    subscribe(node, topic(task_spec(task), 'set_goal'), goals.append)
+    page.act_until(second.tick, lambda p: p.task == task and p.facts.episode > 0)
+    assert not page.picture.facts.is_commanding
+    assert not goals, 'the goal was kept for the first robot'
 
 
-REPORT = {'mode': 'real time', 'paused': 'False', 'rate (Hz)': '25.00', 'commanders': '/somebody'}
+def test_the_page_shows_that_a_robot_is_silent_and_that_it_is_back(node, monkeypatch):
+    monkeypatch.setattr(live, '_SILENCE', 1.5)
+    robot, page = Robot(node), Page(node)
 
+    def is_seen(picture):
+        return picture.facts.commander == '/somebody' and not picture.facts.is_silent
 
-def test_the_page_says_so_when_nothing_is_heard_of_a_robot_any_more(node, monkeypatch):
-    monkeypatch.setattr(live, '_SILENCE', 3.0)
-    robot = Robot(node, Simulation('FetchReach', num_threads=1), JOINT_PREFIX, 0)
-    viewer = live.LiveRobot(node, may_command=True)
-
-    def facts_after(act, condition, patience=20.0):
-        """What the page says once the condition holds, or after so many seconds."""
-        deadline, facts = time.monotonic() + patience, None
-        while time.monotonic() < deadline and not (facts and condition(facts)):
-            act()
-            rclpy.spin_once(node, timeout_sec=0.02)
-            picture = viewer.picture()
-            facts = picture.facts if picture else facts
-        return facts
-
-    def live_on():
-        robot.tick()
-        robot.report(REPORT)
-
-    def is_told(facts):
-        return facts.commander == '/somebody' and not facts.is_silent
-
-    assert is_told(facts_after(live_on, is_told))
-    # One that stands still reports, and no more.
-    assert is_told(facts_after(lambda: robot.report(REPORT), lambda facts: False, 5.0))
-    facts = facts_after(lambda: None, lambda facts: facts.is_silent)
-    assert (facts.is_silent, facts.rate, facts.commander) == (True, 0.0, '')
-    # It is heard again.
-    facts = facts_after(lambda: robot.report(REPORT), is_told)
-    assert is_told(facts) and facts.has_speed
-    lockstep = REPORT | {'mode': 'lockstep'}
-    facts = facts_after(lambda: robot.report(lockstep), lambda facts: not facts.has_speed)
-    assert not facts.has_speed
+    page.act_until(lambda: (robot.tick(), robot.report()), is_seen)
+    # A robot that stands still publishes reports alone.
+    end = time.monotonic() + 2.5
+    page.act_until(robot.report, lambda picture: time.monotonic() > end)
+    assert is_seen(page.picture)
+    page.act_until(lambda: None, lambda picture: picture.facts.is_silent)
+    assert (page.picture.facts.rate, page.picture.facts.commander) == (0.0, '')
+    page.act_until(robot.report, is_seen)
+    assert page.picture.facts.has_speed
+    page.act_until(lambda: robot.report(mode='lockstep'), lambda p: not p.facts.has_speed)
