@@ -57,26 +57,16 @@ class RelativeGoal:
     position_counts: bool = True
     ignores_z_rotation: bool = False
 
-    @property
-    def difference_size(self) -> int:
-        """Length of `difference`."""
-        return {GoalKind.POINT: 6, GoalKind.FINGERTIPS: 15, GoalKind.POSE: 10}[self.goal]
-
-    def size(self, observation_size: int, goal_size: int) -> int:
-        """Return the number of inputs: observation, goal and difference."""
-        return observation_size + goal_size + self.difference_size
-
     def inputs(self, seen: Seen, normalized: Seen) -> Array:
-        """Return the inputs (..., size): normalised observation and goal, then the difference."""
+        """Return the inputs: normalised observation and goal, then the difference."""
         return concatenate(*normalized, self.difference(*seen))
 
-    def goal_position(self, observation_size: int, goal_size: int) -> list[int]:
-        """Return the indices of the inputs that depend on the position of a pose goal."""
-        end = self.size(observation_size, goal_size)
-        return [*range(observation_size, observation_size + 3), *range(end - 3, end)]
+    def goal_position(self, observation_size: int, size: int) -> list[int]:
+        """Return the indices, of `size` inputs, that depend on the position of a pose goal."""
+        return [*range(observation_size, observation_size + 3), *range(size - 3, size)]
 
     def difference(self, observation: Array, goal: Array) -> Array:
-        """Return the difference (..., difference_size) of both in the units of the task."""
+        """Return the difference of both: 6 values of a point, 15 of fingertips, 10 of a pose."""
         achieved = observation[..., self.start : self.start + self.goal.size]
         scale = _POSITION_SCALES[self.goal]
         if self.goal is not GoalKind.POSE:
@@ -108,14 +98,8 @@ class SymmetricObject:
     relative: RelativeGoal
     symmetry: str
 
-    def size(self, observation_size: int, goal_size: int) -> int:
-        """Return the number of inputs; shape and velocity replace 7 values of the observation."""
-        del goal_size
-        shape_size = 15 if self.symmetry == 'cube' else 6
-        return observation_size - 7 + shape_size + 3 + self.relative.difference_size
-
     def inputs(self, seen: Seen, normalized: Seen) -> Array:
-        """Return the inputs (..., size); in the observation, the velocity precedes the pose."""
+        """Return the inputs; in the observation, the velocity precedes the pose."""
         (observation, goal), (normalized_observation, _) = seen, normalized
         start = self.relative.start
         rotation = _rotation_matrix(observation[..., start + 3 : start + 7])
@@ -129,10 +113,10 @@ class SymmetricObject:
             self.relative.difference(observation, goal),
         )
 
-    def goal_position(self, observation_size: int, goal_size: int) -> list[int]:
-        """Return the indices of the inputs that depend on the position of a pose goal."""
-        end = self.size(observation_size, goal_size)
-        return [*range(end - 3, end)]
+    def goal_position(self, observation_size: int, size: int) -> list[int]:
+        """Return the indices, of `size` inputs, that depend on the position of a pose goal."""
+        del observation_size
+        return [*range(size - 3, size)]
 
 
 GoalFeatures = RelativeGoal | SymmetricObject

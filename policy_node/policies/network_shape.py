@@ -54,19 +54,14 @@ class NetworkShape:
     @property
     def past_start(self) -> int:
         """Index of the first past action among the network inputs."""
-        return (
-            self.observation_size
-            if self.goal_features is None
-            else self.feature_size - self.past_size
-        )
+        after = self.goal_size if self.goal_features is None else 0
+        return self.feature_size - self.past_size - after
 
     @property
     def feature_size(self) -> int:
         """Length of the network input."""
-        if self.goal_features is None:
-            return self.input_size + self.goal_size
-        size = self.goal_features.size(self.observation_size, self.goal_size)
-        return size + self.past_size
+        zeros = np.zeros(self.input_size), np.zeros(self.goal_size)
+        return len(self.inputs(zeros, zeros))
 
     def inputs(self, given: Seen, normalized: Seen) -> Array:
         """Return the network inputs (..., feature_size), NumPy or torch.
@@ -81,17 +76,11 @@ class NetworkShape:
         inputs = self.goal_features.inputs((state[..., :size], goal), (seen[..., :size], wanted))
         return concatenate(inputs, seen[..., size:]) if self.past_actions else inputs
 
-    @property
-    def layer_names(self) -> list[str]:
-        """Names of the hidden layers in `Actor`; the LayerNorm of layer i is `norm_names[i]`."""
+    def hidden_names(self) -> list[tuple[str, str]]:
+        """Return the names in `Actor` of each hidden layer and of the LayerNorm after it."""
         stride = 3 if self.layer_norm else 2
-        return [f'network.hidden.{stride * i}' for i in range(len(self.hidden_sizes))]
-
-    @property
-    def norm_names(self) -> list[str]:
-        """Names of the LayerNorms in `Actor`; empty without `layer_norm`."""
-        count = len(self.hidden_sizes) if self.layer_norm else 0
-        return [f'network.hidden.{3 * i + 1}' for i in range(count)]
+        places = range(0, stride * len(self.hidden_sizes), stride)
+        return [(f'network.hidden.{i}', f'network.hidden.{i + 1}') for i in places]
 
     def tensor_shapes(self) -> dict[str, tuple[int, ...]]:
         """Return the shape of every tensor in the state of an `Actor`, by name."""
@@ -99,13 +88,14 @@ class NetworkShape:
         for part, size in (('observation', self.input_size), ('goal', self.goal_size)):
             for statistic in ('mean', 'std'):
                 shapes[f'{part}_normalizer.{statistic}'] = (size,)
-        inputs = (self.feature_size, *self.hidden_sizes)
-        outputs = (*self.hidden_sizes, self.action_size)
-        names = (*self.layer_names, 'network.output')
-        for name, size, width in zip(names, inputs, outputs, strict=True):
+        size = self.feature_size
+        for (name, norm), width in zip(self.hidden_names(), self.hidden_sizes, strict=True):
             shapes[f'{name}.weight'], shapes[f'{name}.bias'] = (width, size), (width,)
-        for name, width in zip(self.norm_names, self.hidden_sizes, strict=False):
-            shapes[f'{name}.weight'] = shapes[f'{name}.bias'] = (width,)
+            if self.layer_norm:
+                shapes[f'{norm}.weight'] = shapes[f'{norm}.bias'] = (width,)
+            size = width
+        shapes['network.output.weight'] = self.action_size, size
+        shapes['network.output.bias'] = (self.action_size,)
         return shapes
 
 

@@ -59,11 +59,10 @@ class NumpyActor(NetworkPolicy):
             return np.tanh(self._forward(features)).astype(np.float32)
 
     def _forward(self, layer: Array) -> Array:
-        shape = self.shape
-        for index, name in enumerate(shape.layer_names):
+        for name, norm in self.shape.hidden_names():
             layer = self._linear(name, layer)
-            if shape.layer_norm:
-                layer = self._norm(shape.norm_names[index], layer)
+            if self.shape.layer_norm:
+                layer = self._norm(norm, layer)
             layer = np.maximum(layer, 0.0)
         return self._linear('network.output', layer)
 

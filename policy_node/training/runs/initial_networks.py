@@ -96,7 +96,8 @@ class InitialNetworks:
         shape = fitted.shape
         # The critic has the inputs of the actor, then the action.
         if shape.goal_features is not None and now.position_counts and not before.position_counts:
-            inputs = shape.goal_features.goal_position(shape.observation_size, shape.goal_size)
+            # Past actions follow the goal features.
+            inputs = shape.goal_features.goal_position(shape.observation_size, shape.past_start)
             changed = {name: fitted.tensors[name].clone() for name in first_weights(fitted.tensors)}
             for weight in changed.values():
                 weight[:, inputs] = 0.0
