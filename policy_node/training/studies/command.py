@@ -74,8 +74,8 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     add('--study', type=find_study, default='paper', metavar='NAME', help=help_of_study)
     default = 'default: the first of the study; all of study best'
     add('--tasks', nargs='+', choices=list(TASKS), metavar='TASK', help=default)
-    help_of_seeds = 'default: 0 to 4 (ingredients: 0 1; best: 0)'
-    add('--seeds', nargs='+', type=_seed, metavar='SEED', help=help_of_seeds)
+    seed, default = whole_number(0), 'default: 0 to 4 (ingredients: 0 1; best: 0)'
+    add('--seeds', nargs='+', type=seed, metavar='SEED', help=default)
     add('--arms', nargs='+', metavar='ARM', help='variants; default: all')
     count = whole_number(1)
     add('--jobs', type=count, help='runs trained in parallel; default: 1; one per core')
@@ -96,14 +96,6 @@ def _whole(text: str) -> int:
         return whole(text)
     except (ValueError, OverflowError):
         raise argparse.ArgumentTypeError(f'{text[:80]!r} is no whole number') from None
-
-
-def _seed(text: str) -> int:
-    try:
-        return int(text)
-    except ValueError:
-        allowed = 'whole numbers with spaces between them: 0 1 2'
-        raise argparse.ArgumentTypeError(f'{text[:80]!r} given; allowed: {allowed}') from None
 
 
 def find_study(name: str) -> Study:
@@ -194,14 +186,12 @@ def _run(options: argparse.Namespace, command: str) -> int:
         jobs = jobs_from_arguments(options)
         if not study.ships:
             require_alike(study, jobs, report)
+            jobs = _not_stored(jobs, report)
     for folder, content in ((output, 'runs'), (report, 'a report')):
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise UsageError(f'{folder} cannot hold {content}: {error.strerror}') from None
-    if not study.ships:
-        with _usage_errors():
-            jobs = _not_stored(jobs, report)
 
     def renew() -> None:
         try:

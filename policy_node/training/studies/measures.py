@@ -46,11 +46,6 @@ class Curve:
         """Return the curve of a stored run."""
         return cls(*np.array(run['curve'], np.float64).reshape(-1, 2).T)
 
-    def steps_to(self, success: float) -> float:
-        """Return the steps of the first evaluation with this success, or infinity."""
-        reached = np.flatnonzero(self.success >= success)
-        return float(self.env_steps[reached[0]]) if reached.size else float('inf')
-
 
 def measure_run(job: Job, command: str) -> dict[str, Any]:
     """Measure a trained job on fresh episodes and return its line of `runs.jsonl`.
@@ -63,21 +58,17 @@ def measure_run(job: Job, command: str) -> dict[str, Any]:
         ValueError: If the log has no evaluation or a file of the run is damaged.
     """
     config, rows = job.config, read_progress(job.folder / PROGRESS_FILE)
-    evaluated = [row for row in rows if 'eval_success' in row]
-    if not evaluated:
+    ticks = ticks_of_40_ms(config.control_hz)
+    points = [
+        (row['env_steps'] / ticks, row['eval_success']) for row in rows if 'eval_success' in row
+    ]
+    if not points:
         raise ValueError(
             f'{job.folder / PROGRESS_FILE} contains no evaluation. '
             f'Remove {job.folder} to train it again.'
         )
-    samples = rows[-1]['updates'] * config.batch_size
-    ticks, last = ticks_of_40_ms(config.control_hz), rows[-1]
-    curve = Curve(
-        np.array([row['env_steps'] / ticks for row in evaluated]),
-        np.array([row['eval_success'] for row in evaluated]),
-    )
-    reached = curve.steps_to(GOOD_SUCCESS)
+    last, curve = rows[-1], Curve(*np.array(points).T)
     seconds = last['processor_seconds']
-    points = zip(curve.env_steps.tolist(), curve.success.tolist(), strict=True)
     return {
         'task': config.task,
         'arm': job.arm.name,
@@ -85,13 +76,13 @@ def measure_run(job: Job, command: str) -> dict[str, Any]:
         'env_steps': int(last['env_steps']),
         'simulated_seconds': round(last['env_steps'] / config.control_hz, 2),
         'area': round(area_under(curve, round(config.total_steps / ticks)), 4),
-        f'steps_to_{GOOD_SUCCESS}': int(reached) if np.isfinite(reached) else None,
+        f'steps_to_{GOOD_SUCCESS}': next((int(n) for n, s in points if s >= GOOD_SUCCESS), None),
         'final_success': _final_success(job),
         'final_episodes': job.final_episodes,
         'updates': int(last['updates']),
         'seconds': round(last['seconds'], 1),
         'processor_seconds': round(seconds, 1),
-        'samples_per_processor_second': round(samples / seconds, 1),
+        'samples_per_processor_second': round(last['updates'] * config.batch_size / seconds, 1),
         'last_mean_value': last.get('mean_value'),
         'parts': len((job.folder / COMMAND_FILE).read_text().splitlines()),
         'machine': f'{processor()}, {os.cpu_count()} cores',

@@ -75,13 +75,16 @@ def write_study(study: Study, output: Path) -> None:
 def sum_up_arms(study: Study, runs: Sequence[Run]) -> list[dict[str, Any]]:
     """Return the rows of `arms.csv`: by task, in the order of the study's variants."""
     first = study.arms[0].name
-    order = {arm.name: index for index, arm in enumerate(study.arms)}
+    order = [arm.name for arm in study.arms]
     rows = []
     for of_task in _grouped(runs, 'task').values():
         arms = _grouped(of_task, 'arm')
-        names = sorted(arms, key=lambda name: order.get(name, len(order)))
+        names = sorted(arms, key=lambda name: order.index(name) if name in order else len(order))
         # The first variant, usually the baseline, sets the time in which areas are compared.
-        seconds = _median_seconds(arms[names[0]])
+        seconds = {
+            machine: float(np.median([run['processor_seconds'] for run in group]))
+            for machine, group in _grouped(arms[names[0]], 'machine').items()
+        }
         measured = {name: [_timed(run, seconds) for run in arms[name]] for name in names}
         baseline = measured.get(first, [])
         for name, group in measured.items():
@@ -101,16 +104,12 @@ def _grouped(runs: Sequence[Run], name: str) -> dict[str, list[Run]]:
     return groups
 
 
-def _median_seconds(runs: Sequence[Run]) -> dict[str, float]:
-    """Return the median processor time of runs by machine."""
-    return {
-        machine: float(np.median([run['processor_seconds'] for run in group]))
-        for machine, group in _grouped(runs, 'machine').items()
-    }
-
-
 def _timed(run: Run, seconds: Mapping[str, float]) -> Run:
-    """Add the area in the baseline's time on the same machine; None if it never ran there."""
+    """Add the area in the baseline's median time on the same machine; None if it never ran there.
+
+    Args:
+        seconds: Processor time of the baseline by machine.
+    """
     known = seconds.get(run['machine'])
     return {**run, 'area_in_time': None if known is None else area_in_time(run, known)}
 
@@ -217,6 +216,7 @@ def draw(bands: Bands, labels: Mapping[str, str]) -> bytes:
         labels: By variant, in the order of their colours; the baseline first.
     """
     from matplotlib.figure import Figure
+    from matplotlib.ticker import EngFormatter
 
     top = _top_of_axis(bands)
     shown = [panel for task, arms in bands.items() for panel in _panels(task, arms, labels)]
@@ -235,7 +235,10 @@ def draw(bands: Bands, labels: Mapping[str, str]) -> bytes:
                 style = '--' if index >= len(_COLORS) else '-'
                 axes.fill_between(band.env_steps, band.lower, band.upper, color=color, alpha=0.2)
                 axes.plot(band.env_steps, band.median, style, color=color, label=label)
-        _label(axes, top)
+        axes.set(xlabel='environment steps (40 ms)', ylabel='success at the last step')
+        axes.set_ylim(-0.02 * top, 1.02 * top)
+        axes.xaxis.set_major_formatter(EngFormatter(sep=''))
+        axes.grid(alpha=0.3)
         axes.set_title(title, fontsize='small' if is_small else 'medium')
     _add_legend(figure, list(panels[: len(shown)]), columns)
     file = io.BytesIO()
@@ -273,12 +276,3 @@ def _top_of_axis(bands: Bands) -> float:
     tops = [band.upper for arms in bands.values() for band in arms.values() if band.upper.size]
     highest = max((float(upper.max()) for upper in tops), default=0.0)
     return 1.0 if highest > 0.4 else max(1.25 * highest, 0.05)
-
-
-def _label(axes: Any, top: float) -> None:
-    from matplotlib.ticker import EngFormatter
-
-    axes.set(xlabel='environment steps (40 ms)', ylabel='success at the last step')
-    axes.set_ylim(-0.02 * top, 1.02 * top)
-    axes.xaxis.set_major_formatter(EngFormatter(sep=''))
-    axes.grid(alpha=0.3)

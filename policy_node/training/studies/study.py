@@ -144,9 +144,6 @@ class Study:
         Step counts scale with the action frequency: equal budgets in simulated time.
 
         Args:
-            tasks: The tasks.
-            arms: The variants.
-            seeds: The seeds.
             overrides: Fields of `TrainConfig` for all runs.
             output: Folder of all runs.
             episodes: Fresh episodes that measure the last actor of each run.

@@ -202,7 +202,6 @@ def test_another_budget_in_the_same_folder_is_refused(
         (['--set', 'seed=1'], '--set seed is not possible: jobs differ in it'),
         (['--set', 'strategy=none'], '--set strategy is not possible: jobs differ in it'),
         (['--arms', 'td3'], "--arms 'td3'; allowed in paper: her_sparse, "),
-        (['--seeds', '-1'], 'seed -1; allowed: 0 ... '),
         (['--steps', '0'], 'total_steps 0; allowed: 1 or more'),
         (
             ['--steps', '9', '--set', 'total_steps=8'],
