@@ -132,7 +132,10 @@ class Health:
         return {name: count - before.get(name, 0) for name, count in counters.items()}
 
     def news(self, report: Report) -> list[str]:
-        """Return the problems that are new in the last report, without numbers."""
+        """Return the problems of `report` that the report before did not have.
+
+        Problems that differ only in their numbers are the same.
+        """
         kinds = {text.partition(':')[0]: text for _, text in report.problems}
         fresh = [text for kind, text in kinds.items() if kind not in self._said]
         self._said = set(kinds)

@@ -181,7 +181,7 @@ class PolicyNode(Node):
         return result
 
     def _load_for_one(self, name: str) -> tuple[LoadedPolicy | None, EpisodeStatus | None]:
-        """Return a policy and the robot that it fits; None for each that is not yet known.
+        """Load a policy; return it and the robot that it fits, None for each that is not yet known.
 
         Raises:
             ValueError: If the policy cannot be loaded, or fits no robot.
@@ -225,7 +225,7 @@ class PolicyNode(Node):
         self._health.stop()
 
     def _announce(self, policy: LoadedPolicy) -> None:
-        """Publish the name of the policy for the robot's log, with its last stamp."""
+        """Publish the name of the policy for the robot's log, with the robot's last stamp."""
         status = topic(task_spec(policy.task), 'policy_status')
         values = {'commander': policy.description, 'checkpoint_sha256': policy.sha256}
         message = build_status(status, self._status_stamp, NODE_NAME, values)
@@ -234,7 +234,7 @@ class PolicyNode(Node):
         publisher.publish(serialize(status.type_name, message))
 
     def _reader(self, spec: TopicSpec, callback: Callable[[Any], None]) -> Callable[[bytes], None]:
-        """Return a callback that passes readable messages on and reports others."""
+        """Return a callback for raw messages: `callback` gets readable ones, others are logged."""
 
         def on_message(data: bytes) -> None:
             try:

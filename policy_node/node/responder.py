@@ -82,7 +82,10 @@ class StampJoin:
         self._pending.clear()
 
     def _is_late(self, delay: int) -> bool:
-        """Return whether a stamp this much before the last one belongs to the same simulation."""
+        """Return whether a stamp `delay` ns before the last one is a late message.
+
+        A longer delay means that the simulation was started again.
+        """
         if not 0 < delay <= _LONGEST_DELAY:
             return delay == 0
         return self._clock() - self._completed_at < _LATEST
@@ -239,7 +242,7 @@ class Responder:
         self._starts_at = self._ends_at = -1
 
     def _forget_last_episode(self) -> None:
-        """Reset the policy if an episode began since the last answered tick."""
+        """Clear the policy's state if an episode began since the last answered tick."""
         before, now = self._answered[0] if self._answered else -1, self._due_stamp
         self._is_first = before < self._starts_at <= now or before <= self._ends_at < now
         if self._is_first or self._answered is None:

@@ -53,7 +53,7 @@ def _linear(input_size: int, output_size: int) -> nn.Linear:
 
 
 class Normalizer(nn.Module):
-    """Clip, centre and scale inputs with the statistics of a checkpoint.
+    """Normalize network inputs with the mean and standard deviation of a checkpoint.
 
     During training, `policy_node.training.experience.experience.RunningStatistics` sets them.
     """
@@ -67,7 +67,7 @@ class Normalizer(nn.Module):
         self.register_buffer('std', torch.ones(size))
 
     def forward(self, values: Tensor) -> Tensor:
-        """Return values (..., size) within +-5 standard deviations of the mean."""
+        """Return (values - mean) / std, (..., size), clipped to [-5, 5]."""
         clipped = values.clamp(-INPUT_CLIP, INPUT_CLIP)
         return ((clipped - self.mean) / self.std).clamp(-NORMALIZED_CLIP, NORMALIZED_CLIP)
 

@@ -175,7 +175,7 @@ def load(path: str | Path, task: str | None = None) -> tuple[Actor, ActorInfo]:
 
 
 def loaded_actor(policy: Policy, info: ActorInfo, path: Path, digest: str) -> LoadedPolicy:
-    """Return an actor of this project, from a checkpoint or ONNX file with this SHA-256."""
+    """Wrap a policy read from a checkpoint or ONNX file; `digest` is the SHA-256 of the file."""
     return LoadedPolicy(policy, info.task, f'actor {path.name}', info.control_hz, digest)
 
 
@@ -272,7 +272,10 @@ def _check_tensors(
 
 
 def _of_type(kind: type, name: str) -> Callable[[object], Any]:
-    """Return a reader of values of one JSON type; true and false are not numbers."""
+    """Return a function that returns a value of the type `kind` and raises ValueError for others.
+
+    Booleans are not numbers. `name` is the name of the type in the error.
+    """
 
     def read_value(value: object) -> Any:
         if type(value) is not kind:

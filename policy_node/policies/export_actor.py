@@ -109,7 +109,7 @@ def export(source: Path, target: Path) -> float:
 
 
 def _whole_network(actor: Actor) -> Any:
-    """Return a module from observation and goal to action, normalisation included."""
+    """Return a torch module that maps observation and goal to the action, with normalisation."""
     from torch import Tensor, nn
 
     class WholeNetwork(nn.Module):

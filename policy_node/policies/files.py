@@ -90,7 +90,7 @@ def write_files(files: Mapping[Path, bytes]) -> None:
 
 @contextlib.contextmanager
 def _named(path: Path) -> Iterator[None]:
-    """Name the file in errors; Python names no file for a full disk."""
+    """Add the path to an OSError raised in the body; Python leaves it out for a full disk."""
     try:
         yield
     except OSError as error:

@@ -58,15 +58,20 @@ class RelativeGoal:
     ignores_z_rotation: bool = False
 
     def inputs(self, seen: Seen, normalized: Seen) -> Array:
-        """Return the inputs: normalised observation and goal, then the difference."""
+        """Return the network inputs: normalised observation and goal, then `difference`.
+
+        Args:
+            seen: Observation and goal, (..., size) each, in the units of the task.
+            normalized: Both, normalised.
+        """
         return concatenate(*normalized, self.difference(*seen))
 
     def goal_position(self, observation_size: int, size: int) -> list[int]:
-        """Return the indices, of `size` inputs, that depend on the position of a pose goal."""
+        """Return which of the `size` network inputs depend on the goal position (pose goals)."""
         return [*range(observation_size, observation_size + 3), *range(size - 3, size)]
 
     def difference(self, observation: Array, goal: Array) -> Array:
-        """Return the difference of both: 6 values of a point, 15 of fingertips, 10 of a pose."""
+        """Return goal minus achieved goal: 6 values of a point, 15 of fingertips, 10 of a pose."""
         achieved = observation[..., self.start : self.start + self.goal.size]
         scale = _POSITION_SCALES[self.goal]
         if self.goal is not GoalKind.POSE:
@@ -99,7 +104,13 @@ class SymmetricObject:
     symmetry: str
 
     def inputs(self, seen: Seen, normalized: Seen) -> Array:
-        """Return the inputs; in the observation, the velocity precedes the pose."""
+        """Return the network inputs, in which the symmetric form replaces pose, velocity and goal.
+
+        Args:
+            seen: Observation and goal, (..., size) each, in the units of the task. The observation
+                ends with the object's velocity and pose.
+            normalized: Both, normalised.
+        """
         (observation, goal), (normalized_observation, _) = seen, normalized
         start = self.relative.start
         rotation = _rotation_matrix(observation[..., start + 3 : start + 7])
@@ -114,7 +125,7 @@ class SymmetricObject:
         )
 
     def goal_position(self, observation_size: int, size: int) -> list[int]:
-        """Return the indices, of `size` inputs, that depend on the position of a pose goal."""
+        """Return which of the `size` network inputs depend on the goal position (pose goals)."""
         del observation_size
         return [*range(size - 3, size)]
 
@@ -158,7 +169,7 @@ def _rotation_matrix(quaternion: Array) -> Array:
 
 
 def _cube_shape(rotation: Array) -> Array:
-    """Return the sums over the axes a of a_i a_j a_k a_l, (..., 15), centred and about +-1."""
+    """Return the 15 distinct sums of a_i a_j a_k a_l over a cube's axes a, scaled to about +-1."""
     second = _second_powers(rotation)
     xx, xy, xz, yy, yz, zz = (second[..., i, :] for i in range(6))
     products = [xx * second[..., i, :] for i in range(6)]
@@ -171,7 +182,7 @@ def _cube_shape(rotation: Array) -> Array:
 
 
 def _axis_shape(rotation: Array) -> Array:
-    """Return the products a_i a_j of the z axis a, (..., 6), centred and about +-1."""
+    """Return the 6 distinct products a_i a_j of the z axis a, scaled to about +-1."""
     second = _second_powers(rotation[..., 2:]).squeeze(-1)
     return 1.5 * (second - _like(second, [1 / 3, 0, 0, 1 / 3, 0, 1 / 3]))
 
@@ -203,7 +214,7 @@ def _z_axis(quaternion: Array) -> Array:
 
 
 def _library(array: Array) -> ModuleType:
-    """Return the library of an array, NumPy or torch; the names used here exist in both."""
+    """Return the module of an array, numpy or torch; both have the functions used here."""
     if isinstance(array, np.ndarray):
         return np
     import torch
@@ -217,12 +228,12 @@ def concatenate(*parts: Array) -> Array:
 
 
 def _like(array: Array, values: list[float]) -> Array:
-    """Return the values as an array of the same kind."""
+    """Return the values as an array of the library, type and device of `array`."""
     return np.asarray(values) if isinstance(array, np.ndarray) else array.new_tensor(values)
 
 
 def _parts(array: Array) -> list[Array]:
-    """Return the slices along the last axis."""
+    """Split an array into its entries along the last axis."""
     return [array[..., i] for i in range(array.shape[-1])]
 
 

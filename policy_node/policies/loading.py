@@ -176,7 +176,7 @@ def _shipped(task: str | None, kind: str) -> Path:
 
 
 def _read(path: Path, task: str | None, trust: bool) -> LoadedPolicy:
-    """Read a file by its suffix; each format imports its own libraries."""
+    """Load a policy file by its suffix; import only the libraries that this format needs."""
     if path.suffix == '.onnx':
         from policy_node.policies.onnx import load_onnx
 
@@ -229,7 +229,7 @@ def is_python_name(name: str) -> bool:
 
 @contextlib.contextmanager
 def working_directory_first() -> Iterator[None]:
-    """Find modules of the working directory first; afterwards find them last.
+    """Put the working directory first in `sys.path` for the body, and last afterwards.
 
     Executables search their own folder first. Later imports find their own modules again.
     """

@@ -113,7 +113,7 @@ def _session(data: bytes, path: Path) -> Any:
 
 
 def _try_out(data: bytes, path: Path) -> None:
-    """Load and run the file within the limits; raise ValueError if it fails."""
+    """Load and run the file in a process with limited memory and time; ValueError if it fails."""
     # -P: do not import modules of the working directory.
     command = [sys.executable, '-P', '-m', __name__, str(path)]
     environment = os.environ | {'PYTHONPATH': os.pathsep.join(p or os.getcwd() for p in sys.path)}

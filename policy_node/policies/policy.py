@@ -151,7 +151,7 @@ class RandomPolicy(MemorylessPolicy):
         self._row_generators: list[np.random.Generator] = []
 
     def start(self, seeds: Sequence[int]) -> None:
-        """Begin an episode in each row of a batch; rows with equal seeds get equal actions."""
+        """Seed one random generator per row of the batch; equal seeds give equal actions."""
         self._row_generators = [np.random.default_rng((seed, _ACTION_STREAM)) for seed in seeds]
 
     def act(self, observation: Observation) -> NDArray[np.float32]:
@@ -252,6 +252,6 @@ def past_before(
 
 
 def past_after(past: NDArray[np.float32], action: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the past actions after `action` (..., action size)."""
+    """Return the past actions with `action` (..., action size) put first and the oldest dropped."""
     kept = past[..., : past.shape[-1] - action.shape[-1]]
     return np.concatenate([action, kept], axis=-1).astype(np.float32)

@@ -130,7 +130,7 @@ def _statistics(file: Path, content: bytes) -> Any:
 
 
 def _algorithm(data: bytes, path: Path) -> Any:
-    """Return the algorithm class of a file, found by the policy class in it."""
+    """Return the algorithm class that matches the policy class named in a model file."""
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as file:
             module = json.loads(file.read('data'))['policy_class']['__module__']

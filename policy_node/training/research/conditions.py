@@ -54,7 +54,7 @@ class ConditionedTransitions(Transitions):
 
 @dataclass(frozen=True, kw_only=True)
 class ThresholdSampler(TransitionSampler):
-    """Draws a success threshold for each transition, as a multiple of that of training.
+    """Draws a success threshold for each transition, as a multiple of the task's threshold.
 
     Multiples are log-uniform. Coarse goals are reached often, and their value may generalize to
     fine ones. The widest threshold should be wider than the distance at the start of an episode.
@@ -83,7 +83,7 @@ class ThresholdSampler(TransitionSampler):
         goal: Array32,
         generator: np.random.Generator,
     ) -> ConditionedTransitions:
-        """Return transitions with logarithms of the multiples as conditions."""
+        """Return transitions; the condition is the logarithm of the drawn multiple."""
         low, high = np.log(SMALLEST_THRESHOLD), np.log(self.widest)
         drawn = np.exp(generator.uniform(low, high, len(starts.row)))
         spec = self.metric.spec
@@ -103,7 +103,7 @@ class ThresholdSampler(TransitionSampler):
 
 @dataclass(frozen=True, kw_only=True)
 class HorizonSampler(TransitionSampler):
-    """Draws a number of steps left; values are sums of that many rewards (TDM, arXiv 1802.09081).
+    """Draws how many steps are left; a value sums that many rewards (TDM, arXiv 1802.09081).
 
     Attributes:
         ticks: Length of an episode; conditions are shares of it.
@@ -118,7 +118,10 @@ class HorizonSampler(TransitionSampler):
         goal: Array32,
         generator: np.random.Generator,
     ) -> ConditionedTransitions:
-        """Return transitions; the value of the next state counts if a step is left there."""
+        """Return transitions; the condition is the share of steps left, drawn uniformly.
+
+        The discount is 0 where no step is left after the transition.
+        """
         left = generator.integers(1, self.ticks + 1, len(starts.row)).astype(np.float64)
         batch = super().transitions(starts, steps, goal, generator)
         batch = replace(batch, discount=batch.discount * (left > 1.0))
@@ -144,7 +147,7 @@ class ConditionedDDPG(DDPG):
         return actor, self.critic_loss.make(inputs, shape)
 
     def tensors(self, batch: Transitions) -> TensorBatch:
-        """As `DDPG`; the condition follows the features."""
+        """Return the tensors of `DDPG`, with the condition appended to the features."""
         assert isinstance(batch, ConditionedTransitions)
         tensors = super().tensors(batch)
         features = torch.cat([tensors.features, self.tensor(batch.condition)], dim=-1)
@@ -153,7 +156,7 @@ class ConditionedDDPG(DDPG):
         return replace(tensors, features=features, next_features=next_features)
 
     def plain(self, network: MLP) -> Actor:
-        """As `ActorCritic`, at the input at which the actor acts."""
+        """Return an actor without the condition input, which is fixed at `acting_input`."""
         actor = copy.deepcopy(self.actor)
         actor.network = fold(network, actor.shape, _ACTING[self.config.condition])
         return actor.cpu().eval()
@@ -164,7 +167,7 @@ class ConditionedDDPG(DDPG):
 
 
 def fold(network: MLP, shape: NetworkShape, value: float) -> MLP:
-    """Return a network without its last input, which is `value` for good.
+    """Return a network without its last input, which is fixed at `value`.
 
     Args:
         network: Its first layer has `shape.feature_size` + 1 inputs.
@@ -177,7 +180,7 @@ def fold(network: MLP, shape: NetworkShape, value: float) -> MLP:
 
 
 def without_input(tensors: dict[str, Tensor], column: int, value: float) -> dict[str, Tensor]:
-    """Return the tensors of networks without the input at `column`, which is `value` for good."""
+    """Return tensors of networks without the input `column`, which is fixed at `value`."""
     changed = {}
     for name in first_weights(tensors):
         weight, bias = tensors[name], name.removesuffix('weight') + 'bias'

@@ -56,14 +56,14 @@ class Ensemble(nn.Module):
         return torch.stack([member.outputs(features, action) for member in members])
 
     def completed(self, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Return the tensors, with its own for the members that they lack."""
+        """Return `tensors`, completed with this ensemble's own for members that are missing."""
         given = {_member_of(name) for name in tensors}
         own = self.state_dict().items()
         return {name: value for name, value in own if _member_of(name) not in given} | tensors
 
 
 def critic_tensors(tensors: dict[str, Tensor], critics: int) -> dict[str, Tensor]:
-    """Return the tensors of one critic or an ensemble as named for another number of critics.
+    """Rename the tensors of one critic or an ensemble for an ensemble of another size.
 
     Args:
         tensors: Tensors of a `Critic` or an `Ensemble`.
@@ -90,7 +90,7 @@ def count_critics(tensors: dict[str, Tensor]) -> int:
 
 
 def _member_of(name: str) -> int:
-    """Return the index of the member of an `Ensemble` that has a tensor."""
+    """Return the index of the `Ensemble` member to which the tensor `name` belongs."""
     return int(name.removeprefix(_MEMBERS).split('.')[0])
 
 
@@ -106,12 +106,12 @@ class EnsembleLoss(CriticLoss):
         return members[0] if len(members) == 1 else Ensemble(members)
 
     def make_one(self, features: int, shape: NetworkShape) -> Critic:
-        """Return a new member."""
+        """Return one new critic."""
         shape_here = hidden_layers(shape, self.options.norm)
         return Critic(features + shape.action_size, shape_here, self.options.quantiles)
 
     def pooled(self, values: Tensor) -> Tensor:
-        """Return the aggregate of all critics, (batch,)."""
+        """Aggregate the values (critics, batch) of all critics into one value, (batch,)."""
         return values if self.options.critics == 1 else AGGREGATES[self.options.aggregate](values)
 
 
@@ -136,7 +136,7 @@ class QuantileLoss(EnsembleLoss):
 
 
 def sample_of(quantiles: Tensor, truncated: bool) -> Tensor:
-    """Return the quantiles of all critics as one sample of the return, (batch, kept).
+    """Merge the quantiles of all critics into one sample of the return, (batch, kept).
 
     Args:
         quantiles: (critics, batch, count), or (batch, count) of one critic.
@@ -177,7 +177,7 @@ class BatchNormLoss(EnsembleLoss):
     """
 
     def make_one(self, features: int, shape: NetworkShape) -> Critic:
-        """Return a new member with a batch normalization after every hidden linear layer."""
+        """Return one new critic with a batch normalization after every hidden linear layer."""
         critic = super().make_one(features, shape)
         _add_batch_norm(critic.network)
         return critic
@@ -220,16 +220,16 @@ def critic_loss(options: Critics) -> CriticLoss:
 
 
 class NoTargets(TargetNetworks):
-    """The learning networks instead of slow copies."""
+    """Uses the online networks where `TargetNetworks` uses slowly moving copies."""
 
     def __init__(self, actor: MLP, critic: nn.Module) -> None:
         self.actor, self.critic = actor, critic
 
     def move(self, learner: DDPG) -> None:
-        """Do nothing: the networks have moved already."""
+        """Do nothing: there are no target networks to update."""
 
     def modules(self) -> dict[str, nn.Module]:
-        """Return nothing: the learner has these modules."""
+        """Return no modules: the learner itself saves the online networks."""
         return {}
 
 

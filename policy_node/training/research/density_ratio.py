@@ -54,7 +54,7 @@ class DensityRatio(nn.Module):
         self.optimizer = torch.optim.Adam(self.parameters(), lr=_LEARNING_RATE)
 
     def update(self, chosen: Inputs, shuffled: Inputs) -> Tensor:
-        """Improve the classifiers on chosen and shuffled goals; return weights (batch,), mean 1."""
+        """Train the classifiers on chosen and shuffled goals; return weights (batch,), mean 1."""
         logits = [
             (self.before(before).squeeze(-1), self.after(after).squeeze(-1))
             for before, after in (chosen, shuffled)
@@ -73,7 +73,11 @@ class DensityRatio(nn.Module):
 
 
 def _difference(goal: Tensor, achieved: Tensor) -> Tensor:
-    """Return the difference to the goal at a fine and at a coarse scale, (batch, goal_size + 1)."""
+    """Return inputs for the classifiers, (batch, goal_size + 1).
+
+    The scaled and clipped difference per axis shows small distances; the logarithm of the distance
+    shows large ones.
+    """
     difference = goal - achieved
     distance = difference.norm(dim=-1, keepdim=True)
     near = (_NEAR * difference).clamp(-NORMALIZED_CLIP, NORMALIZED_CLIP)
@@ -107,7 +111,7 @@ class WeightedDDPG(DDPG):
         return (self._weight * self.critic_loss.costs(self, batch)).mean()
 
     def _weights(self, batch: TensorBatch) -> Tensor:
-        """Improve the classifiers and return the weights (batch,) of transitions."""
+        """Train the classifiers; return the importance weights (batch,) of transitions."""
         goal = batch.goal.roll(1, dims=0)
         features = self.actor.features(batch.observation, goal)
         next_features = self.actor.features(batch.next_observation, goal)
@@ -123,7 +127,7 @@ class WeightedDDPG(DDPG):
         return before, torch.cat([before, batch.next_features, led_to], dim=-1)
 
     def importance(self, batch: Transitions) -> Array32:
-        """Improve the classifiers on a batch and return its weights, (batch,)."""
+        """Train the classifiers on a batch; return its importance weights, (batch,)."""
         weight: Array32 = self._weights(self.tensors(batch)).cpu().numpy()
         return weight
 

@@ -23,13 +23,13 @@ from policy_node.training.learners.ddpg import DDPG, TensorBatch
 
 
 def ticks_of(length: Array32, most: int) -> NDArray[np.int64]:
-    """Return the ticks, 1 ... `most`, of lengths in [-1, 1], any shape."""
+    """Convert lengths in [-1, 1] to whole numbers of ticks, 1 ... `most`; any shape."""
     share = (np.asarray(length, np.float64) + 1.0) / 2.0
     return 1 + np.rint(share * (most - 1)).astype(np.int64)
 
 
 def length_of(ticks: NDArray[np.int64], most: int) -> Array32:
-    """Return the lengths in [-1, 1] of numbers of ticks, float32."""
+    """Convert numbers of ticks, 1 ... `most`, to lengths in [-1, 1], float32."""
     return (2.0 * (ticks - 1) / (most - 1) - 1.0).astype(np.float32)
 
 
@@ -65,12 +65,15 @@ class HoldingCollector(Collector):
 
 
 class HoldingSampler(TransitionSampler):
-    """Returns are as long as their action holds; `most_steps` is the longest."""
+    """Samples transitions whose return has as many steps as their action still holds.
+
+    `most_steps` is the longest.
+    """
 
     def steps(
         self, starts: Starts, goal: Array32, generator: np.random.Generator
     ) -> NDArray[np.int64]:
-        """Return the steps (batch,) of each return."""
+        """Return the steps (batch,) of each return: the ticks that its action still holds."""
         del goal, generator
         length = starts.episodes.action[starts.row, starts.tick, -1]
         left: NDArray[np.int64] = starts.last - starts.tick
@@ -85,12 +88,12 @@ class HoldingDDPG(DDPG):
         return super()._penalty(batch, action[..., :-1])
 
     def evaluation_actor(self) -> Actor:
-        """As `ActorCritic`, without the length."""
+        """Return the actor to evaluate, without the output for the length of an action."""
         return plain_actor(super().evaluation_actor(), self.config)
 
 
 def plain_actor(actor: Actor, config: TrainConfig) -> Actor:
-    """Return an actor without the length of its actions; any other actor unchanged."""
+    """Return an actor without the output for the length; an actor that has none is unchanged."""
     action_size = task_spec(config.task).robot.action_size
     if actor.shape.action_size == action_size:
         return actor
@@ -110,7 +113,7 @@ _FIRST_SCALE = 0.05
 
 
 class PerturbedActors(MemorylessPolicy):
-    """Actors that each act for their share of the rows."""
+    """Several perturbed actors; each acts for an equal part of the batch."""
 
     def __init__(self, actors: list[Actor]) -> None:
         self._actors = actors

@@ -76,7 +76,7 @@ class GambleSimulation(Simulation):
         return StepResult(observation, reward, success, result.diverged)
 
     def _freeze(self, ids: NDArray[np.intp], observation: Array) -> None:
-        """Store the observations of simulations that have just gambled."""
+        """Store the constant observation of each simulation in `ids` that has just gambled."""
         frozen, parts = observation[ids], self._parts
         frozen[:, parts[self.spec.achieved_goal]] = self._landing[ids]
         if self.spec.has_object:

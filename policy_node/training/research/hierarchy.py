@@ -200,7 +200,10 @@ class SubgoalSampler(TransitionSampler):
         generator: np.random.Generator,
         valid_ticks: NDArray[np.int64] | None = None,
     ) -> Transitions:
-        """As `TransitionSampler`, from episodes no shorter than a subgoal."""
+        """Draw transitions of the high level; arguments as `TransitionSampler.sample`.
+
+        Episodes must have at least as many ticks as a subgoal.
+        """
         del valid_ticks
         starts = Starts(episodes, row, self._ticks(episodes, len(row), generator))
         goal = self.relabel(starts, mixture, generator)
@@ -212,14 +215,17 @@ class SubgoalSampler(TransitionSampler):
     def _ticks(
         self, episodes: Episodes, count: int, generator: np.random.Generator
     ) -> NDArray[np.int64]:
-        """Draw the first ticks (count,): a share of them where a proposal was made."""
+        """Draw the ticks (count,) at which transitions begin; some are ticks with a proposal."""
         last, every = episodes.ticks - self.most_steps, self.most_steps
         decision = every * generator.integers(last // every + 1, size=count)
         anywhere = generator.integers(last + 1, size=count)
         return np.where(generator.random(count) < _DECISIONS, decision, anywhere)
 
     def _with_tests(self, starts: Starts, batch: Transitions) -> Transitions:
-        """Return the batch; missed tests have the lowest value for any goal."""
+        """Return the batch with a penalty for tested subgoals that were missed.
+
+        Their action is the subgoal and their value is the lowest possible, for any goal.
+        """
         subgoal = subgoals_of(starts)
         pairs = batch.action.astype(np.float64), subgoal.astype(np.float64)
         reward = self.compute_reward(*pairs)
@@ -268,7 +274,7 @@ class HighLevel(DDPG):
         self._is_pose = task_spec(config.task).goal is GoalKind.POSE
 
     def tensors(self, batch: Transitions) -> TensorBatch:
-        """As `DDPG`, with goals as actions in [-1, 1]."""
+        """Return the tensors of `DDPG`; the actions, which are goals, are scaled to [-1, 1]."""
         tensors = super().tensors(batch)
         action = self.actor.goal_normalizer(tensors.action) / NORMALIZED_CLIP
         return replace(tensors, action=action)
@@ -287,7 +293,7 @@ class HierarchicalDDPG(DDPG):
         self.high = HighLevel(shape, self)
 
     def update(self, batch: Transitions) -> Losses:
-        """Improve both levels on a batch and return the losses of the actor."""
+        """Update both levels on a batch; return the losses of the low level."""
         assert isinstance(batch, HierarchicalTransitions)
         # A training state contains only the number of updates of the actor.
         self.high.updates = self.updates
@@ -295,12 +301,12 @@ class HierarchicalDDPG(DDPG):
         return super().update(batch)
 
     def average(self) -> None:
-        """As `ActorCritic`, both levels."""
+        """Call this method of `ActorCritic` for both levels."""
         super().average()
         self.high.average()
 
     def set_progress(self, progress: float) -> None:
-        """As `ActorCritic`, both levels."""
+        """Call this method of `ActorCritic` for both levels."""
         super().set_progress(progress)
         self.high.set_progress(progress)
 

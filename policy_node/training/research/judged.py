@@ -29,7 +29,7 @@ CANDIDATES = 8
 
 @torch.no_grad()
 def bellman(learner: DDPG, batch: Transitions) -> Array32:
-    """Return the absolute error of each value, (batch,), averaged over critics."""
+    """Return the absolute Bellman error of each transition, (batch,), averaged over critics."""
     with learner.precision():
         errors = CriticLoss.errors(learner.critic_loss, learner, learner.tensors(batch))
     error = errors.abs().float()
@@ -39,7 +39,7 @@ def bellman(learner: DDPG, batch: Transitions) -> Array32:
 
 @torch.no_grad()
 def uncertain(learner: DDPG, batch: Transitions) -> Array32:
-    """Return the standard deviation of each value over critics, (batch,)."""
+    """Return the standard deviation over critics of each transition's value, (batch,)."""
     tensors = learner.tensors(batch)
     with learner.precision():
         value = learner.critic(tensors.features, tensors.action).float()
@@ -56,10 +56,10 @@ SCORES: dict[str, Callable[[DDPG, Transitions], Array32]] = {
 
 @dataclass(frozen=True, kw_only=True)
 class ChoosingSampler(TransitionSampler):
-    """Takes the best of several future goals.
+    """Relabels with the future goal, of several drawn, from which the critic learns most.
 
     Attributes:
-        judge: The learner that is asked.
+        judge: The learner whose critic or actor is asked.
         choice: `bellman` (largest error of the value) or `uncertain` (largest difference between
             critics).
     """
@@ -70,7 +70,7 @@ class ChoosingSampler(TransitionSampler):
     def relabel(
         self, starts: Starts, mixture: dict[str, float], generator: np.random.Generator
     ) -> Array32:
-        """Draw goals and replace those from the future by better ones."""
+        """Draw goals; replace each future goal by the best of several, as `choice` ranks them."""
         source = draw_sources(mixture, len(starts.row), generator)
         goal = goals_of(starts, source, list(mixture), generator)
         rows = np.flatnonzero(np.array(list(mixture))[source] == 'future')
@@ -79,7 +79,7 @@ class ChoosingSampler(TransitionSampler):
         return goal
 
     def _best(self, starts: Starts, first: Array32, generator: np.random.Generator) -> Array32:
-        """Return the best of several future goals of each transition, (batch, goal_size)."""
+        """Return the future goals (batch, goal_size) that `choice` ranks first."""
         candidates, source = [first], np.zeros(len(first), np.intp)
         for _ in range(CANDIDATES - 1):
             candidates.append(goals_of(starts, source, ['future'], generator))
@@ -110,7 +110,7 @@ class CuttingSampler(TransitionSampler):
     """Returns that end before an action far from the actor's.
 
     Attributes:
-        judge: The learner that is asked.
+        judge: The learner whose critic or actor is asked.
         cut_distance: Largest distance from the actor's action, root mean square.
     """
 
@@ -120,7 +120,7 @@ class CuttingSampler(TransitionSampler):
     def steps(
         self, starts: Starts, goal: Array32, generator: np.random.Generator
     ) -> NDArray[np.int64]:
-        """Return the steps (batch,) of each return."""
+        """Return the number of steps (batch,) of each return, up to the first distant action."""
         most = super().steps(starts, goal, generator)
         steps = np.ones_like(most)
         episodes = starts.episodes
@@ -146,7 +146,7 @@ class JudgedExperience(Experience):
     judged: TransitionSampler
 
     def narrow(self, progress: float) -> None:
-        """As `Experience`, with both samplers."""
+        """Narrow the thresholds of both samplers; `progress` is the share of training done."""
         super().narrow(progress)
         self.judged = self.judged.at(progress)
 

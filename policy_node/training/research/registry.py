@@ -97,7 +97,9 @@ def make_collector(simulation: Simulation, seeds: list[int], config: TrainConfig
 def make_sampler(
     config: TrainConfig, metric: GoalMetric, judge: DDPG | None = None
 ) -> TransitionSampler:
-    """Return what makes transitions; some samplers ask a learner, `judge`, if it is given.
+    """Return the sampler of transitions that the configuration selects.
+
+    Two samplers ask a learner, `judge`; without it the plain one takes their place.
 
     Raises:
         ValueError: If the configuration replaces the own reward of a third-party task.
@@ -166,12 +168,12 @@ def network_shape(config: TrainConfig) -> NetworkShape:
 
 
 def _extra_actions(config: TrainConfig) -> int:
-    """Return the number of outputs of the actor beside the action: the length of an action."""
+    """Return how many outputs the actor has beside the action: 1 if actions have a length."""
     return int(config.longest_hold > 1)
 
 
 def _weights_of(config: TrainConfig, spec: TaskSpec) -> Weigh:
-    """Return the function that finds episodes with a motion, the landing of a gamble left out."""
+    """Return the function that marks episodes in which something moved; a gamble does not count."""
     if not config.gamble:
         return has_moved
     return lambda episodes: has_moved(gamble.without_landings(episodes, spec))

@@ -107,11 +107,15 @@ class RolloutMaker:
         return RolloutTransitions(**flat)
 
     def _under(self, episodes: Episodes, meant: Array32 | None = None) -> dict[str, Array32]:
-        """Return the transitions (episodes, T, ...) for the goals that the episodes have.
+        """Compute rewards, values and advantages of episodes for their `desired_goal`.
 
         Args:
-            meant: Log probabilities (episodes, T) of the actions for their original goals; None
-                treats the goals of the episodes as the original ones.
+            episodes: Episodes, perhaps with relabelled goals.
+            meant: Log probabilities (episodes, T) of the actions for the goals before relabelling,
+                for importance weights; None if the goals are the original ones.
+
+        Returns:
+            Fields of `RolloutTransitions`, (episodes, T, ...).
         """
         observation, action = episodes.observation, episodes.action
         goal = np.repeat(episodes.desired_goal[:, None], episodes.ticks + 1, axis=1)
@@ -263,7 +267,7 @@ class OnPolicyExperience(Experience):
         self._weight_up_to = np.zeros(0)
 
     def batch(self, env_steps: int) -> Transitions:
-        """Draw from the rollouts of the newest cycle; its first call makes them."""
+        """Draw from the rollouts of the newest cycle, which the first call of a cycle makes."""
         if self._rollouts is None or env_steps != self._made_after:
             self._rollouts, self._made_after = self._roll_out(), env_steps
         row, ticks = self._draw_rows(), self.replay.ticks

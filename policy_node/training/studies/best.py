@@ -56,7 +56,7 @@ _OVERLAPPING = {'overlap': True, 'precision': 'auto'}
 
 
 def _start(task: str) -> Start:
-    """Return the start of a task in `_STARTS_FROM`."""
+    """Return the task and fields whose trained networks `task` starts from."""
     coarse = _COARSE_FIRST if task_spec(task).position_counts else {}
     held = _HELD if 'Pen' in task else {}
     return Start(_STARTS_FROM[task], {**_FINE_TUNING, **coarse, **held})

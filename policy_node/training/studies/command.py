@@ -216,7 +216,7 @@ def _run(options: argparse.Namespace, command: str) -> int:
 
 @contextlib.contextmanager
 def _usage_errors() -> Iterator[None]:
-    """Report invalid values in one line."""
+    """Turn a ValueError of the body into a usage error, one line and exit code 2."""
     try:
         yield
     except (ValueError, TypeError) as error:
@@ -236,7 +236,7 @@ def _not_stored(jobs: Sequence[Job], folder: Path) -> list[Job]:
 def _place(
     options: argparse.Namespace, report: Path, command: str
 ) -> contextlib.AbstractContextManager[Place]:
-    """Return the place where the jobs run."""
+    """Return where the jobs run: this process, several processes or Ray."""
     cores = len(os.sched_getaffinity(0))
     limit = options.jobs or (cores if options.study.ships else 1)
     if options.ray:

@@ -178,7 +178,7 @@ def is_significant(arm: Mapping[str, Any], baseline: Mapping[str, Any], name: st
 def compared(
     runs: Sequence[Mapping[str, Any]], baseline: Sequence[Mapping[str, Any]]
 ) -> dict[str, float | str]:
-    """Return p of each measure against the baseline as `<name>_p`; empty without runs."""
+    """Return the p-value of each measure against the baseline as `<name>_p`; empty without runs."""
     found: dict[str, float | str] = {}
     for name in COMPARED:
         first, second = (
@@ -191,7 +191,7 @@ def compared(
 
 
 def rank_sum_chance(first: Sequence[float], second: Sequence[float]) -> float:
-    """Return two-sided p of the exact rank-sum test (Wilcoxon 1945) by permutation, with ties."""
+    """Return the two-sided p-value of the exact rank-sum test (Wilcoxon 1945), with ties."""
     values = np.concatenate([first, second])
     # Twice the mid-ranks: whole numbers.
     ranks = 2 * (values[:, None] > values).sum(axis=1) + (values[:, None] == values).sum(axis=1) + 1

@@ -25,7 +25,7 @@ FIGURE = 'figure'
 
 @dataclass(frozen=True, slots=True)
 class Published:
-    """One number.
+    """A published success rate.
 
     Attributes:
         success: Success at the last step, as text.
@@ -83,7 +83,7 @@ _NOT_PUBLISHED = 'no number found'
 
 
 def actors_table(actors: Path) -> str:
-    """Returns the Markdown table of the actors in a folder.
+    """Return a Markdown table of the evaluated actors in a folder.
 
     Raises:
         ValueError: If a file is no evaluation of an actor; the line names it.
@@ -96,7 +96,7 @@ def actors_table(actors: Path) -> str:
 
 
 def actors_summary(actors: Path) -> str:
-    """Returns the same in five short columns, without sources.
+    """Return `actors_table` in five short columns, without sources.
 
     Raises:
         ValueError: If a file is no evaluation of an actor; the line names it.

@@ -105,10 +105,11 @@ def _grouped(runs: Sequence[Run], name: str) -> dict[str, list[Run]]:
 
 
 def _timed(run: Run, seconds: Mapping[str, float]) -> Run:
-    """Add the area in the baseline's median time on the same machine; None if it never ran there.
+    """Add `area_in_time`: the mean success within the time that the baseline needs.
 
     Args:
-        seconds: Processor time of the baseline by machine.
+        seconds: Median processor time of the baseline, by machine. On other machines
+            `area_in_time` is None.
     """
     known = seconds.get(run['machine'])
     return {**run, 'area_in_time': None if known is None else area_in_time(run, known)}
@@ -249,7 +250,7 @@ def draw(bands: Bands, labels: Mapping[str, str]) -> bytes:
 def _panels(
     task: str, arms: Mapping[str, Band], labels: Mapping[str, str]
 ) -> list[tuple[str, str, list[str]]]:
-    """Return task, title and variants of each panel that shows a task."""
+    """Divide the variants of a task among panels; return task, title and variants of each."""
     names = [name for name in labels if name in arms]
     if len(names) <= _MOST_LINES:
         return [(task, task, names)]
@@ -271,7 +272,7 @@ def _add_legend(figure: Any, panels: Sequence[Any], columns: int) -> None:
 
 
 def _top_of_axis(bands: Bands) -> float:
-    """Return 1, or less where no variant reaches half of it."""
+    """Return the upper limit of the success axis: 1, or less if no variant reaches .5."""
     # Curves without a common step have an empty band.
     tops = [band.upper for arms in bands.values() for band in arms.values() if band.upper.size]
     highest = max((float(upper.max()) for upper in tops), default=0.0)

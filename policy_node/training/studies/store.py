@@ -69,7 +69,7 @@ def in_order(runs: Iterable[Run], study: Study) -> list[Run]:
 
 
 def holds(runs: Runs, job: Job) -> bool:
-    """Return whether the runs include one with the job's name, configuration and measure."""
+    """Return whether the runs include this job, with its configuration and final evaluation."""
     run = runs.get(job.key)
     if run is None or run['final_episodes'] != job.final_episodes:
         return False
@@ -77,7 +77,10 @@ def holds(runs: Runs, job: Job) -> bool:
 
 
 def _differing_runs(run: Run, job: Job) -> dict[str, str]:
-    """Return the differing fields of two runs of different places; here the start counts too."""
+    """Return the configuration fields in which a stored run and a job differ, in words.
+
+    Seeds may differ. Unlike `differing_fields`, it compares the start networks (`init_from`), too.
+    """
     before, now = run['config'].get('init_from', ''), job.config.init_from
     start = {} if before == now else {'init_from': f'init_from {before!r}, now {now!r}'}
     stored = {**run['config'], 'seed': job.config.seed}
@@ -91,7 +94,7 @@ def own_fields(study: Study) -> set[str]:
 
 
 def require_alike(study: Study, jobs: Sequence[Job], folder: Path) -> None:
-    """Reject jobs that are configured otherwise than the runs beside which they would stand.
+    """Reject jobs whose configuration differs from the stored runs of the same task.
 
     Raises:
         ValueError: The message names one run and the differing fields.

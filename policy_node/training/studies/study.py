@@ -250,13 +250,13 @@ class Job:
 
 
 def to_settings(config: TrainConfig) -> dict[str, Any]:
-    """Return a configuration as JSON values."""
+    """Convert a configuration to JSON values, one per field."""
     values: dict[str, Any] = json.loads(json.dumps(to_flat(config)))
     return values
 
 
 def differing_fields(stored: Mapping[str, Any], config: TrainConfig) -> dict[str, str]:
-    """Return the fields that make another result likely, each with both values in words.
+    """Return the differing fields that change the result, each with both values in words.
 
     Args:
         stored: A configuration from `to_settings`; missing fields have their default.

@@ -150,7 +150,7 @@ class ThisProcess:
         self._ended.append((job, attempt(job, self._report, self._command)))
 
     def wait(self) -> tuple[Job, int]:
-        """Return the last job."""
+        """Return the job that `start` has run, and its exit status."""
         return self._ended.pop()
 
 
@@ -201,7 +201,7 @@ class Processes:
             process.terminate()
 
     def wait(self) -> tuple[Job, int]:
-        """Wait for one of the processes."""
+        """Wait until a process has ended; return its job and exit status."""
         while not (ended := wait(list(self._running), timeout=_STATUS_SECONDS)):
             for job, _ in self._running.values():
                 _print(job.status)
@@ -224,7 +224,7 @@ class Processes:
 
 
 def _work(job: Job, report: Path, command: str) -> None:
-    """Run in a process of `Processes`."""
+    """Train and measure one job: the function that each process of `Processes` runs."""
     # In the group of the parent, Ctrl-C would arrive twice. The session stays the same: Linux
     # schedules by session, so `nice` would have no effect in another.
     os.setpgid(0, 0)
@@ -263,7 +263,7 @@ class Ray:
         self._running[remote.remote(absolute, self._report, self._command)] = job
 
     def wait(self) -> tuple[Job, int]:
-        """Wait for one of the jobs."""
+        """Wait until a job has ended; return it and its exit status."""
         (done, *_), _ = self._ray.wait(list(self._running))
         job = self._running.pop(done)
         try:
