@@ -18,14 +18,16 @@ Observations = Mapping[str, ArrayLike]
 
 
 class ActionNoise:
-    """Gaussian noise; with probability `epsilon` a uniformly random action instead.
+    """Exploration noise: Gaussian, or a uniformly random action in place of the policy's.
 
     Args:
         shape: (simulations, action size).
-        ticks: Number of ticks for which noise and random actions hold.
+        std: Standard deviation of the Gaussian noise; actions are in [-1, 1].
+        epsilon: Probability that a simulation gets a random action.
+        ticks: Number of ticks before noise and random actions are drawn again.
 
     Attributes:
-        share: Factor on `std` and `epsilon`, 0 ... 1.
+        share: Factor on `std` and `epsilon`, from 0 (no exploration) to 1.
     """
 
     def __init__(
@@ -45,7 +47,11 @@ class ActionNoise:
         self._replaced = np.zeros(shape[0], np.bool_)
 
     def around(self, action: NDArray[Any], tick: int) -> Array32:
-        """Return actions (N, action size) with noise for a tick of an episode."""
+        """Return `action` (simulations, action size) with exploration noise, clipped to [-1, 1].
+
+        `tick` counts from the start of the episode, so that all episodes draw noise at the same
+        ticks.
+        """
         share = self.share
         if tick % self._ticks == 0:
             self._uniform = self._generator.uniform(-1.0, 1.0, self._shape).astype(np.float32)
@@ -57,13 +63,16 @@ class ActionNoise:
 
 
 class Collector:
-    """Steps all simulations through one episode at a time.
+    """Runs all simulations through one episode at a time and records it.
 
-    It owns its random generator and uses nothing of the learner. So it can run in another thread
-    and returns the same episodes for the same policy.
+    A collector has its own random generator and shares no state with the learner. So it can run in
+    another thread and returns the same episodes for the same policy.
 
     Args:
         seeds: One seed per simulation for its resets; the first also seeds exploration.
+        extra_actions: Additional outputs of the policy. They are recorded, with noise, but not sent
+            to the simulation.
+        extra_columns: Additional recorded columns of an action, which a subclass fills in.
 
     Attributes:
         exploration: Factor on all noise, 0 ... 1.
@@ -97,7 +106,8 @@ class Collector:
         """Run one episode in every simulation.
 
         Returns:
-            The episodes, without those whose simulation diverged, and their success rate.
+            The episodes, without those whose simulation diverged, and the share of them that
+            succeeded at the last step (0 if all diverged).
         """
         simulation = self.simulation
         spec = simulation.spec
@@ -130,17 +140,28 @@ class Collector:
         return episodes.select(whole), float(success[whole].mean()) if whole.any() else 0.0
 
     def _begin(self, policy: Policy) -> Policy:
-        """Prepare the noise; return the policy that acts in these episodes."""
+        """Set the noise before new episodes; return the policy that acts in them.
+
+        Here this is `policy` itself. Subclasses may return another one, for example a perturbed
+        copy.
+        """
         self._noise.share = self.exploration
         return policy
 
     def _end(self, policy: Policy, acting: Policy, episodes: Episodes) -> None:
-        """Adapt the noise to the collected episodes."""
+        """Do nothing after the episodes; a subclass may adapt its noise here.
+
+        `policy` is the policy to explore around; `acting` is the one that acted, from `_begin`.
+        """
 
     def _explore(
         self, policy: Policy, observation: Observations, past: Array32, tick: int
     ) -> Array32:
-        """Return the actions (N, columns) of a tick, with noise."""
+        """Return the noisy actions (simulations, columns) for one tick.
+
+        `past` is the action history (simulations, past actions * action size), without columns if
+        the policy sees no past actions.
+        """
         return self._noise.around(self._predict(policy, observation, past), tick)
 
     def _predict(self, policy: Policy, observation: Observations, past: Array32) -> NDArray[Any]:

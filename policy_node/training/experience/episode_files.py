@@ -1,4 +1,4 @@
-"""Episodes in files: the newest of a replay, and logged ones as experience."""
+"""Save and load the newest episodes of a replay; convert logged episodes to training data."""
 
 from __future__ import annotations
 
@@ -17,7 +17,9 @@ from policy_node.training.experience.replay import EpisodeReplay, Episodes
 
 
 def save_replay(path: Path, replay: EpisodeReplay, transitions: int) -> None:
-    """Write the newest episodes of a replay, at least `transitions` transitions.
+    """Write the newest episodes of a replay to a file, with `transitions` transitions or more.
+
+    A replay with fewer transitions is written completely.
 
     Raises:
         OSError: If the file cannot be written; no partial file is left.
@@ -27,10 +29,10 @@ def save_replay(path: Path, replay: EpisodeReplay, transitions: int) -> None:
 
 
 def load_replay(path: Path, replay: EpisodeReplay) -> None:
-    """Add the episodes of a file to a replay.
+    """Add the episodes of a file from `save_replay` to a replay, the newest ones if not all fit.
 
     Raises:
-        ValueError: If the file cannot be read or does not fit.
+        ValueError: If the file cannot be read, is damaged or contains arrays of other sizes.
     """
     try:
         tensors = load_file(path)
@@ -42,10 +44,11 @@ def load_replay(path: Path, replay: EpisodeReplay) -> None:
 
 
 def _require_whole(episodes: Episodes) -> None:
-    """Reject damaged episodes.
+    """Raise ValueError if episodes from a file are damaged.
 
     Raises:
-        ValueError: If a value is no finite float32 or the arrays have different lengths.
+        ValueError: If an array is not float32, has a value that is not finite, or the arrays differ
+            in their number of episodes.
     """
     for name in Episodes.__slots__:
         array = getattr(episodes, name)
@@ -60,19 +63,19 @@ def _require_whole(episodes: Episodes) -> None:
 def read_experience(
     directory: Path, task: TaskSpec, control_hz: float = DEFAULT_CONTROL_HZ
 ) -> tuple[Episodes, list[str]]:
-    """Loads the episodes of a task that the trainer can learn from.
+    """Load the logged episodes of a task that the trainer can learn from.
 
     Args:
         directory: Episodes of `sim_node` or `fetch_hand_sim episodes generate`.
-        task: The task; episodes of others are left out.
-        control_hz: Action frequency, Hz; episodes at another are left out.
+        task: The task; episodes of other tasks are skipped.
+        control_hz: Action frequency, Hz; episodes at other frequencies are skipped.
 
     Returns:
-        The episodes, and one line for each that was left out: damaged, of another task or rate,
-        interrupted, or with a goal that changed on the way.
+        The usable episodes, and one line for each skipped one: damaged, of another task or
+        frequency, interrupted, or with a goal that changed on the way.
 
     Raises:
-        ValueError: If nothing is left.
+        ValueError: If the directory has no usable episode.
     """
     skipped: list[str] = []
     loaded = load_episodes(directory, on_skip=lambda error: skipped.append(str(error)))
@@ -92,7 +95,7 @@ def read_experience(
 
 
 def why_unusable(episode: EpisodeArrays, task: TaskSpec, control_hz: float) -> str:
-    """Returns why the trainer cannot take an episode, '' if it can."""
+    """Return why the trainer cannot learn from an episode, '' if it can."""
     if episode.spec.name != task.name:
         return f'{episode.spec.name}, not {task.name}'
     if episode.record.control_hz != control_hz:
@@ -105,7 +108,7 @@ def why_unusable(episode: EpisodeArrays, task: TaskSpec, control_hz: float) -> s
 
 
 def to_experience(episodes: Sequence[EpisodeArrays]) -> Episodes:
-    """Returns episodes of one task and full length as the arrays of the trainer, float32."""
+    """Convert logged episodes of one task and equal length to the float32 arrays of the trainer."""
 
     def stack(arrays: list[np.ndarray]) -> np.ndarray:
         return np.stack(arrays).astype(np.float32)

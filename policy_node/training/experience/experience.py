@@ -30,7 +30,7 @@ SMALLEST_STD = 0.01
 
 
 class RunningStatistics(nn.Module):
-    """Sums over all inputs; `write` sets the mean and deviation of a `Normalizer` from them."""
+    """Running sums of network inputs; a `Normalizer` gets its mean and deviation from them."""
 
     count: Tensor
     total: Tensor
@@ -42,9 +42,9 @@ class RunningStatistics(nn.Module):
             self.register_buffer(name, torch.zeros(length, dtype=torch.float64))
 
     def update(self, values: ArrayLike, workers: Workers) -> None:
-        """Add the rows of `values` (..., size) of all workers, clipped as inputs of networks are.
+        """Add the rows of `values` (..., size) of all workers to the sums.
 
-        All workers must call this together.
+        Values are clipped first, as network inputs are. All workers must call this together.
         """
         array = np.asarray(values, dtype=np.float64)
         rows = np.clip(array.reshape(-1, array.shape[-1]), -INPUT_CLIP, INPUT_CLIP)
@@ -56,7 +56,7 @@ class RunningStatistics(nn.Module):
         self.total_square += added[1 + size :]
 
     def write(self, normalizer: Normalizer) -> None:
-        """Set the normalizer to these statistics; without any it stays unchanged."""
+        """Set mean and standard deviation of the normalizer; do nothing before any `update`."""
         if not self.count:
             return
         mean = self.total / self.count
@@ -66,11 +66,15 @@ class RunningStatistics(nn.Module):
 
 
 class Experience:
-    """Replay of one worker, and the statistics of the normalizers, which all workers share.
+    """The replay of one worker, the batches drawn from it and the statistics for the normalizers.
+
+    All workers have the same statistics; each has its own episodes.
 
     Args:
         config: The configuration; `replay_transitions` and `batch_size` are totals of all workers.
-        weigh: Weights of episodes for `moved_share`.
+        extra_columns: Recorded columns of an action beside the robot's action.
+        weigh: Function that returns the weight of each episode. The share `moved_share` of a batch
+            is drawn by these weights.
     """
 
     def __init__(
@@ -109,13 +113,14 @@ class Experience:
 
     @property
     def transitions(self) -> int:
-        """Number of stored transitions."""
+        """Number of transitions in the replay of this worker."""
         return len(self.replay) * self._spec.episode_ticks
 
     def normalize(self, episodes: Episodes, actor: Actor) -> None:
-        """Add episodes to the statistics and update the actor; all workers call it together.
+        """Add new episodes to the statistics and set the normalizers of `actor` from them.
 
-        Goals count as the networks will get them: relabelled.
+        The goals are relabelled first, because the networks learn from relabelled goals. All
+        workers must call this together, also without episodes.
         """
         observation, goal = episodes.observation[:, :-1], episodes.desired_goal
         if len(episodes):
@@ -131,11 +136,14 @@ class Experience:
             self.statistics[name].write(normalizer)
 
     def narrow(self, progress: float) -> None:
-        """Use the reward at this progress of the run, 0 ... 1."""
+        """Use the reward for this progress of the run, 0 ... 1; its thresholds may narrow."""
         self._sampler = self._sampler.at(progress)
 
     def batch(self, env_steps: int) -> Transitions:
-        """Draw the transitions of one update and relabel their goals."""
+        """Draw the transitions for one update and relabel their goals.
+
+        `env_steps`, the environment steps so far, matters only in subclasses.
+        """
         del env_steps
         return self._draw(self.mixture())
 
@@ -147,11 +155,11 @@ class Experience:
         )
 
     def _draw_rows(self) -> NDArray[np.int64]:
-        """Draw the episode of each transition of a batch."""
+        """Draw an episode for each transition of a batch; return rows of the replay, (batch,)."""
         return self.replay.draw(self.batch_size, self.config.moved_share, self.generator)
 
     def mixture(self) -> dict[str, float]:
-        """Return the probability of each goal source."""
+        """Return the probability of each goal source; they add up to 1."""
         config = self.config
         return goal_mixture(config.strategy, config.hindsight_k, config.goals)
 
@@ -159,10 +167,10 @@ class Experience:
 def ticks_until_dropped(
     spec: TaskSpec, more: int
 ) -> Callable[[Episodes], NDArray[np.int64]] | None:
-    """Return the function that counts the ticks of episodes until `more` after a drop.
+    """Return a function that counts the ticks of each episode to learn from, (episodes,).
 
-    An object has dropped once its centre is below the palm. None if nothing can drop or `more` is
-    negative: then every tick counts.
+    These end `more` ticks after the object dropped, which means that its centre is below the palm.
+    Return None, for all ticks, if the task has no object in a hand or `more` is negative.
     """
     if spec.goal is not GoalKind.POSE or more < 0:
         return None

@@ -1,5 +1,6 @@
-"""Hindsight experience replay: relabel goals when a batch is drawn; rewards are recomputed.
+"""Hindsight experience replay: replace goals in a batch, for example by ones achieved later.
 
+Goals are replaced when a batch is drawn, and rewards are computed for the new goals.
 Andrychowicz et al. 2017, "Hindsight Experience Replay" (arXiv 1707.01495). The `futureactual`
 mixture is from Pitis et al. 2020 (arXiv 2007.02832). A new source of goals is a function in
 `SOURCES` and a name in `configuration.config.SOURCES`.
@@ -25,12 +26,14 @@ _NEAR_TICKS = 10
 
 
 def goal_mixture(strategy: str, k: int = 4, goals: Mapping[str, float] = {}) -> dict[str, float]:
-    """Return the probability of each goal source.
+    """Return the probability of each goal source; they add up to 1.
 
     Args:
         strategy: `none`, `final`, `future`, `episode`, `random`: k relabelled goals for each real
             one. `futureactual`: k/2 future goals, k/2 desired goals of other episodes, 1 real goal.
-        goals: Mixture instead of the strategy; the rest up to 1 keeps the goals of episodes.
+        k: Number of relabelled goals for each real one.
+        goals: Probability of each source, instead of `strategy` and `k`. If they add up to less
+            than 1, the rest is `real`: transitions keep the goal of their episode.
     """
     share = k / (k + 1)
     if goals:
@@ -46,7 +49,10 @@ def goal_mixture(strategy: str, k: int = 4, goals: Mapping[str, float] = {}) -> 
 def draw_sources(
     mixture: dict[str, float], count: int, generator: np.random.Generator
 ) -> NDArray[np.intp]:
-    """Draw goal sources: indices (count,) into the names of the mixture."""
+    """Draw a goal source for each of `count` transitions.
+
+    Return indices (count,) into the names of `mixture`, which contains their probabilities.
+    """
     bounds = np.cumsum(list(mixture.values()))
     return np.searchsorted(bounds / bounds[-1], generator.random(count), side='right')
 
@@ -58,13 +64,13 @@ def goals_of(
     generator: np.random.Generator,
     sources: Mapping[str, Source] | None = None,
 ) -> Array32:
-    """Return goals (batch, goal_size), each from the source `names[source]`.
+    """Return a goal for each transition, (batch, goal_size), from the source drawn for it.
 
     Args:
-        starts: Where the transitions begin.
-        source: Index of the source of each goal, (batch,).
+        starts: The first states of the transitions.
+        source: Index into `names` for each transition, (batch,).
         names: Names of the sources; `real` keeps the goal of the episode.
-        sources: Functions by name, by default `SOURCES`.
+        sources: Function of each source by name, `SOURCES` if None.
     """
     sources = SOURCES if sources is None else sources
     goal = starts.episodes.desired_goal.take(starts.row, axis=0)
@@ -76,39 +82,39 @@ def goals_of(
 
 
 def _future(starts: Starts, generator: np.random.Generator) -> Array32:
-    """Achieved later in the episode. This includes the state that the transition leads to."""
+    """Return goals achieved in the same episode, in the state after the transition or later."""
     return _achieved(starts, generator.integers(starts.tick + 1, starts.last + 1))
 
 
 def _final(starts: Starts, generator: np.random.Generator) -> Array32:
-    """Achieved at the end of the episode."""
+    """Return the goals achieved at the last valid state of the same episode."""
     del generator
     return _achieved(starts, starts.last)
 
 
 def _episode(starts: Starts, generator: np.random.Generator) -> Array32:
-    """Achieved at any time in the episode."""
+    """Return goals achieved in any valid state of the same episode, except the first."""
     return _achieved(starts, generator.integers(1, starts.last + 1))
 
 
 def _random(starts: Starts, generator: np.random.Generator) -> Array32:
-    """Achieved at any time in any episode."""
+    """Return goals achieved in any valid state of any episode, except the first of each."""
     row = generator.integers(len(starts.episodes), size=len(starts.row))
     return _episode(replace(starts, row=row), generator)
 
 
 def _actual(starts: Starts, generator: np.random.Generator) -> Array32:
-    """Desired goals of any episodes."""
+    """Return the desired goals of random episodes."""
     row = generator.integers(len(starts.episodes), size=len(starts.row))
     return starts.episodes.desired_goal.take(row, axis=0)
 
 
 def _displaced(starts: Starts, generator: np.random.Generator) -> Array32:
-    """Goals near the achieved ones that do not depend on where the transitions lead.
+    """Return goals near the goal achieved at the start of each transition.
 
-    If a goal is chosen because a step led there, the critic learns that such steps lead there; with
-    contacts this is partly luck. Here the achieved goal moves by the distance of another one within
-    ten ticks of its episode.
+    A goal that is chosen because a step led there teaches the critic that such steps lead there.
+    With contacts this is partly luck. So the start is displaced by an independent motion: between
+    two states of a random episode, at most ten ticks apart.
     """
     episodes, count = starts.episodes, len(starts.row)
     row = generator.integers(len(episodes), size=count)
@@ -132,7 +138,10 @@ SOURCES: dict[str, Source] = {
 
 
 def displace(here: Array32, before: Array32, after: Array32) -> Array32:
-    """Return goals (batch, goal_size): `here` moved, and turned, as `before` moved to `after`."""
+    """Move the goals `here` as the goals `before` moved to `after`; each is (batch, goal_size).
+
+    Poses are also turned by the rotation from `before` to `after`.
+    """
     moved: Array32 = here + (after - before)
     if moved.shape[-1] == GoalKind.POSE.size:
         turn = quaternion_multiply(after[:, 3:], quaternion_conjugate(before[:, 3:]))
@@ -141,11 +150,11 @@ def displace(here: Array32, before: Array32, after: Array32) -> Array32:
 
 
 def _achieved(starts: Starts, state: NDArray[np.int64]) -> Array32:
-    """Return the goals (batch, goal_size) achieved in these states of the episodes."""
+    """Return the goals (batch, goal_size) achieved at the ticks `state`, (batch,)."""
     achieved = flat(starts.episodes.achieved_goal)
     return achieved.take(starts.row * (starts.episodes.ticks + 1) + state, axis=0)
 
 
 def flat(values: Array32) -> Array32:
-    """Return the rows of all episodes, one after the other."""
+    """Reshape (episodes, ticks, size) to (episodes * ticks, size), to index it with `take`."""
     return values.reshape(-1, values.shape[-1])

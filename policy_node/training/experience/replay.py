@@ -1,4 +1,4 @@
-"""Replay of whole episodes, because hindsight needs later states, and batches of transitions."""
+"""Replay of whole episodes, and batches of transitions. Hindsight needs whole episodes."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ MOVED_DISTANCE = 0.01
 
 @dataclass(frozen=True, slots=True)
 class Episodes:
-    """Episodes of equal length T.
+    """Arrays of several episodes, all of T steps.
 
     Attributes:
         observation: (episodes, T + 1, observation_size).
@@ -44,7 +44,7 @@ class Episodes:
         return self.select(slice(-count, None))
 
     def select(self, rows: NDArray[np.bool_ | np.int64] | slice) -> Episodes:
-        """Return the episodes at these rows or where a row is True; a slice returns views."""
+        """Return the episodes that an index array, a mask or a slice (no copies) selects."""
         return Episodes(*(getattr(self, name)[rows] for name in Episodes.__slots__))
 
 
@@ -53,18 +53,19 @@ Weigh = Callable[[Episodes], NDArray[np.float64]]
 
 
 class EpisodeReplay:
-    """Ring buffer of the newest episodes, in arrays allocated once.
+    """Ring buffer of the newest episodes, in arrays that are allocated once.
 
-    Linux grants the memory as episodes arrive.
+    Linux maps the memory only as episodes fill it.
 
     Args:
-        weigh: Weights of episodes for `draw`.
-        count_ticks: Number of ticks of each episode that may be drawn, from its first; None is
-            all of them.
+        capacity: Largest number of episodes.
+        ticks: Steps per episode.
+        weigh: Function that returns the weight of each episode for `draw`; None is `has_moved`.
+        count_ticks: Function that returns how many ticks of each episode, from its first, may be
+            drawn; None allows all.
 
     Attributes:
-        capacity: Largest number of episodes.
-        last_added: Number of episodes of the last `add`.
+        last_added: Number of episodes in the last call of `add`.
     """
 
     def __init__(
@@ -111,20 +112,20 @@ class EpisodeReplay:
         return self._ring.ticks
 
     def bytes_of(self, count: int) -> int:
-        """Return the memory in bytes of `count` episodes, at most of `capacity`."""
+        """Return the memory of min(count, capacity) episodes, in bytes."""
         whole = sum(getattr(self._ring, name).nbytes for name in Episodes.__slots__)
         return int(whole) * min(count, self.capacity) // self.capacity
 
     def newest(self, count: int) -> Episodes:
-        """Return copies of the newest `count` episodes, or of all, the newest last."""
+        """Return copies of the newest episodes, at most `count`; the newest is last."""
         number = min(count, self._size)
         return self._ring.select((self._next - number + np.arange(number)) % self.capacity)
 
     def add(self, episodes: Episodes) -> None:
-        """Add episodes in place of the oldest ones.
+        """Store episodes; a full replay overwrites its oldest ones.
 
         Raises:
-            ValueError: If they exceed the capacity or have other sizes.
+            ValueError: If there are more than `capacity` or their arrays have other sizes.
         """
         for name in Episodes.__slots__:
             given, held = getattr(episodes, name).shape[1:], getattr(self._ring, name).shape[1:]
@@ -147,21 +148,21 @@ class EpisodeReplay:
 
     @property
     def valid_ticks(self) -> NDArray[np.int64] | None:
-        """Number of ticks of each episode that may be drawn; None if all."""
+        """How many ticks of each stored episode, from its first, may be drawn; None if all."""
         return None if self._count_ticks is None else self._valid[: self._size]
 
     def draw(
         self, count: int, weighted_share: float, generator: np.random.Generator
     ) -> NDArray[np.int64]:
-        """Draw episodes with replacement, in proportion to their valid ticks.
+        """Draw episodes with replacement, with probabilities proportional to their valid ticks.
 
         Args:
-            count: Number of episodes.
-            weighted_share: Share drawn in proportion to weights as well; without effect if all
-                weights are 0.
+            count: Number of episodes to draw.
+            weighted_share: Share of the draws, 0 ... 1, whose probability is also proportional to
+                the weight of the episode. It has no effect if all weights are 0.
 
         Returns:
-            Rows of `episodes`, (count,).
+            Row numbers of `episodes`, (count,).
         """
         if self._count_ticks is None:
             row = generator.integers(self._size, size=count)
@@ -174,7 +175,10 @@ class EpisodeReplay:
 
 
 def draw_by(sums: Array, count: int, generator: np.random.Generator) -> NDArray[np.int64]:
-    """Draw rows; `sums` are the cumulative sums of their unnormalized probabilities."""
+    """Draw `count` row numbers with the probabilities whose cumulative sums are `sums`.
+
+    The last sum may differ from 1.
+    """
     # A draw may round up to the last sum: it means the last row with a weight above 0.
     last = np.searchsorted(sums, sums[-1])
     row = np.searchsorted(sums, sums[-1] * generator.random(count), 'right')
@@ -182,7 +186,7 @@ def draw_by(sums: Array, count: int, generator: np.random.Generator) -> NDArray[
 
 
 def has_moved(episodes: Episodes) -> NDArray[np.float64]:
-    """Return 1 where the achieved goal of an episode left its start, else 0, (episodes,)."""
+    """Return (episodes,): 1 if the achieved goal of an episode ever left its start, else 0."""
     offset = episodes.achieved_goal - episodes.achieved_goal[:, :1]
     moved = np.square(offset).sum(axis=-1).max(axis=-1) > MOVED_DISTANCE**2
     return np.asarray(moved, dtype=np.float64)
@@ -193,10 +197,11 @@ class Starts:
     """The states in which the transitions of a batch begin.
 
     Attributes:
-        row: Episode of each transition, (batch,).
-        tick: Tick of its first state, (batch,).
-        valid_ticks: Number of ticks of each episode that count, from its first, (episodes,); None
-            is all.
+        episodes: The episodes from which the transitions are drawn.
+        row: Row number of the episode of each transition, (batch,).
+        tick: Tick of the first state of each transition, (batch,).
+        valid_ticks: How many ticks of each episode, from its first, may be used, (episodes,); None
+            for all.
     """
 
     episodes: Episodes
@@ -206,27 +211,28 @@ class Starts:
 
     @property
     def last(self) -> NDArray[np.int64]:
-        """Last valid state of each episode, (batch,)."""
+        """Tick of the last valid state in the episode of each transition, (batch,)."""
         if self.valid_ticks is None:
             return np.full(len(self.row), self.episodes.ticks)
         return self.valid_ticks.take(self.row)
 
     def select(self, chosen: NDArray[np.intp]) -> Starts:
-        """Return the transitions at these indices."""
+        """Return only the transitions with these indices."""
         return Starts(self.episodes, self.row[chosen], self.tick[chosen], self.valid_ticks)
 
 
 @dataclass(frozen=True, slots=True)
 class Transitions:
-    """A batch for one update, float32. A target is reward + discount * next value.
+    """A batch for one update, float32. The target of the critic is reward + discount * next value.
 
     Attributes:
         observation: (batch, observation_size).
-        next_observation: (batch, observation_size), at the end of the return.
+        next_observation: (batch, observation_size), one step later, or at the end of an n-step
+            return.
         goal: (batch, goal_size), after relabelling.
         action: (batch, action_size).
-        reward: (batch,) for `goal`.
-        discount: (batch,) factor on the value of the next state.
+        reward: (batch,) for `goal`; the discounted sum over an n-step return.
+        discount: (batch,) factor on the value of `next_observation`.
     """
 
     observation: Array32

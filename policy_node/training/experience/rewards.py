@@ -1,4 +1,4 @@
-"""The reward of training: that of the task, with other thresholds or several of them."""
+"""Rewards for training: the reward of the task, also with wider or several success thresholds."""
 
 from __future__ import annotations
 
@@ -17,14 +17,17 @@ Values = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class GradedReward:
-    """A reward from -1 to 0: the share of thresholds met by distance times rotation, minus 1.
+    """A reward between -1 and 0 that rises with the number of thresholds met.
 
-    The sparse reward does not show how nearly a goal was missed or how safely it was met. So an
-    actor holds an object no better than the threshold needs. With goals of position and rotation
-    it forgets one of them while it never meets both.
+    It is the share of distance thresholds met, times the share of rotation thresholds met if the
+    goal has a rotation, minus 1. The sparse reward does not show how nearly a goal was missed or
+    how safely it was met. With the sparse reward, an actor holds an object no better than the
+    threshold needs. If goals have a position and a rotation, it forgets one of them as long as it
+    never meets both.
 
     Attributes:
-        grades: Multiples of its thresholds; 1 alone is the sparse reward.
+        metric: Distance and rotation to the goal, and the success thresholds.
+        grades: Factors on the success thresholds; (1,) gives the sparse reward.
     """
 
     metric: GoalMetric
@@ -45,10 +48,10 @@ class GradedReward:
 
 
 def reward_schedule(config: TrainConfig, metric: GoalMetric) -> Callable[[float], RewardFunction]:
-    """Return the function from progress, 0 ... 1, to the reward at that time of the run.
+    """Return a function from the progress of a run, 0 ... 1, to the reward function to use then.
 
     Raises:
-        ValueError: If the configuration replaces the own reward of a third-party task.
+        ValueError: If `reward_grades` would replace the reward of a third-party task.
     """
     if metric.has_own_reward and config.reward_grades:
         raise ValueError(
@@ -64,12 +67,16 @@ def reward_schedule(config: TrainConfig, metric: GoalMetric) -> Callable[[float]
 
 
 def own_reward(metric: GoalMetric) -> str:
-    """Return the name of a task's own reward, for messages."""
+    """Return a description of the reward that a task defines itself, for error messages."""
     return f'the reward of {metric.spec.name} itself ({type(metric).__name__})'
 
 
 def narrowed(metric: GoalMetric, config: TrainConfig, progress: float) -> GoalMetric:
-    """Return the metric with the thresholds of a run's progress, 0 ... 1."""
+    """Return `metric` with the success thresholds to use at this progress of a run, 0 ... 1.
+
+    Thresholds start wider by `first_distance` and `first_rotation` and reach those of the task at
+    two thirds of the run.
+    """
     left = max(1.0 - 1.5 * progress, 0.0)
     distance, rotation = config.first_distance**left, config.first_rotation**left
     spec = replace(metric.spec, distance_threshold=metric.spec.distance_threshold * distance)

@@ -29,12 +29,18 @@ RewardAfter = Callable[[Array32, NDArray[np.int64]], NDArray[np.float64]]
 
 @dataclass(frozen=True, slots=True)
 class TransitionSampler:
-    """Makes transitions from episodes.
+    """Draws transitions from episodes, relabels their goals and computes their rewards.
 
     Attributes:
         compute_reward: (achieved_goal, desired_goal) -> reward, batched.
-        lost_value: Value after the last valid tick of an episode; None bootstraps as usual.
-        reward_at: Progress, 0 ... 1 -> `compute_reward` at that time; None if it never changes.
+        gamma: Discount per tick.
+        most_steps: Longest n-step return; 1 for single transitions.
+        reward_scale: Factor on all rewards.
+        lost_value: Value of the state after the last valid tick of an episode that is cut there;
+            None bootstraps as usual.
+        reward_at: Progress of the run, 0 ... 1 -> `compute_reward` at that time; None if it never
+            changes.
+        sources: Functions that draw goals, by name of the goal source.
     """
 
     compute_reward: RewardFunction
@@ -46,7 +52,7 @@ class TransitionSampler:
     sources: Mapping[str, Source] = field(default_factory=lambda: SOURCES)
 
     def at(self, progress: float) -> TransitionSampler:
-        """Return the sampler with the reward at this progress of the run, 0 ... 1."""
+        """Return a sampler with the reward for this progress of the run, 0 ... 1."""
         if self.reward_at is None:
             return self
         return replace(self, compute_reward=self.reward_at(progress))
@@ -59,12 +65,13 @@ class TransitionSampler:
         generator: np.random.Generator,
         valid_ticks: NDArray[np.int64] | None = None,
     ) -> Transitions:
-        """Draw a transition of each chosen episode and relabel its goal.
+        """Draw one transition from each chosen episode and relabel its goal.
 
         Args:
-            row: Episode of each transition, (batch,).
-            mixture: Probability of each goal source; adds up to 1.
-            valid_ticks: Number of ticks of each episode that count, from its first; None is all.
+            row: Row number of the episode for each transition, (batch,).
+            mixture: Probability of each goal source; they add up to 1.
+            valid_ticks: How many ticks of each episode, from its first, may be drawn, (episodes,);
+                None for all.
         """
         if valid_ticks is None:
             tick = generator.integers(episodes.ticks, size=len(row))
@@ -81,14 +88,18 @@ class TransitionSampler:
     def relabel(
         self, starts: Starts, mixture: dict[str, float], generator: np.random.Generator
     ) -> Array32:
-        """Draw the goals (batch, goal_size) of transitions from the sources of a mixture."""
+        """Draw a goal for each transition, (batch, goal_size), from the sources in `mixture`."""
         source = draw_sources(mixture, len(starts.row), generator)
         return goals_of(starts, source, list(mixture), generator, self.sources)
 
     def steps(
         self, starts: Starts, goal: Array32, generator: np.random.Generator
     ) -> NDArray[np.int64]:
-        """Return the steps (batch,) of each return, 1 ... `most_steps`, within the episode."""
+        """Return the length of each n-step return in steps, (batch,).
+
+        It is `most_steps`, or less if the valid states end before. Subclasses also use `goal` and
+        `generator`.
+        """
         del goal, generator
         steps: NDArray[np.int64] = np.minimum(starts.last - starts.tick, self.most_steps)
         return steps
@@ -100,7 +111,10 @@ class TransitionSampler:
         goal: Array32,
         generator: np.random.Generator,
     ) -> Transitions:
-        """Return transitions for goals (batch, goal_size)."""
+        """Return the transitions of a batch: single ones, or n-step returns of the lengths `steps`.
+
+        `goal` is (batch, goal_size), after relabelling.
+        """
         del generator
         if self.most_steps == 1:
             return self.single(starts, goal)
@@ -112,7 +126,7 @@ class TransitionSampler:
         return self.several(starts, steps, goal, reward_after)
 
     def single(self, starts: Starts, goal: Array32) -> Transitions:
-        """Return transitions of one step; faster than `several`."""
+        """Return transitions of one step each; faster than `several` with `steps` of 1."""
         episodes, row, tick = starts.episodes, starts.row, starts.tick
         state = row * (episodes.ticks + 1) + tick
         observation = flat(episodes.observation)
@@ -130,7 +144,10 @@ class TransitionSampler:
     def several(
         self, starts: Starts, steps: NDArray[np.int64], goal: Array32, reward_after: RewardAfter
     ) -> Transitions:
-        """Return transitions of several steps, with the discounted sums of their rewards."""
+        """Return n-step transitions of the lengths `steps`, (batch,), with discounted rewards.
+
+        `reward_after` returns the rewards for achieved goals and the indices of their transitions.
+        """
         episodes, row, tick = starts.episodes, starts.row, starts.tick
         total = np.zeros(len(steps))
         for step in range(int(steps.max(initial=0))):
@@ -148,10 +165,10 @@ class TransitionSampler:
 
 
 def sampler_fields(config: TrainConfig, metric: GoalMetric) -> dict[str, Any]:
-    """Return the attributes of a `TransitionSampler` for a configuration.
+    """Return the arguments of `TransitionSampler` that follow from a configuration, by name.
 
     Raises:
-        ValueError: If the configuration replaces the own reward of a third-party task.
+        ValueError: If `reward_grades` would replace the reward of a third-party task.
     """
     reward_at = reward_schedule(config, metric)
     return {
@@ -167,7 +184,11 @@ def sampler_fields(config: TrainConfig, metric: GoalMetric) -> dict[str, Any]:
 def _with_losses(
     starts: Starts, steps: NDArray[np.int64], batch: Transitions, value: float
 ) -> Transitions:
-    """Return the batch; transitions into the last valid state end with `value`."""
+    """Return the batch with no bootstrap where an episode was cut after a drop.
+
+    Transitions into the last valid state of such an episode get `value` as the next value, as part
+    of their reward, and a discount of 0.
+    """
     lost = (starts.tick + steps == starts.last) & (starts.last < starts.episodes.ticks)
     reward = batch.reward + lost * batch.discount * np.float32(value)
     return replace(batch, reward=reward.astype(np.float32), discount=batch.discount * ~lost)

@@ -1,4 +1,4 @@
-"""An actor, its critic and their optimizers: what all learners share."""
+"""Base class of all learners: an actor, its critic and their optimizers."""
 
 from __future__ import annotations
 
@@ -21,7 +21,11 @@ from policy_node.training.machine import Workers
 
 @dataclass(frozen=True, slots=True)
 class Losses:
-    """Scalars of one update, as tensors on the device, so that no code waits for them."""
+    """Losses and mean value of one update.
+
+    They are tensors on the device of the networks: reading them as numbers would wait for the
+    device.
+    """
 
     critic: Tensor
     actor: Tensor
@@ -29,10 +33,13 @@ class Losses:
 
 
 class ActorCritic:
-    """An actor, its critic and their optimizers; subclasses define an update.
+    """Base class of learners: an actor, its critic and their optimizers.
+
+    A subclass implements `update`. `average_actor` is a running average of the actor's weights,
+    which is evaluated and saved.
 
     Args:
-        workers: This worker among all; gradients are averaged over all.
+        workers: Processes that train together; gradients are averaged over them.
     """
 
     def __init__(
@@ -61,13 +68,13 @@ class ActorCritic:
         return torch.optim.Adam(parameters, lr=self.config.learning_rate, fused=True)
 
     def update(self, batch: Transitions) -> Losses:
-        """Improve the networks on a batch."""
+        """Improve the networks by one gradient update on a batch; return the losses."""
         raise NotImplementedError
 
     def step(
         self, optimizer: torch.optim.Adam, loss: Tensor, parameters: Sequence[nn.Parameter]
     ) -> None:
-        """Take one optimizer step down the gradients of a loss, averaged over workers."""
+        """Take one optimizer step on `parameters` with the gradient of `loss` over all workers."""
         gradients = torch.autograd.grad(loss, parameters)
         self.workers.average_gradients(gradients)
         for parameter, gradient in zip(parameters, gradients, strict=True):
@@ -76,13 +83,16 @@ class ActorCritic:
 
     @torch.no_grad()
     def average(self) -> None:
-        """Move the averaged actor towards the actor, once per cycle."""
+        """Move the averaged actor towards the actor; the trainer calls this once per cycle."""
         weight = 1.0 - self.config.actor_average
         averaged: list[Tensor] = list(self.average_actor.parameters())
         torch._foreach_lerp_(averaged, [*self.actor_parameters], weight)
 
     def acting_policy(self) -> Policy:
-        """Return the policy that collects: a copy of the actor on the CPU."""
+        """Return the policy that collects episodes: a copy of the actor on the CPU.
+
+        The copy keeps its weights while the learner continues in another thread.
+        """
         return self.plain(self.actor.network)
 
     def evaluation_actor(self) -> Actor:
@@ -90,40 +100,43 @@ class ActorCritic:
         return self.plain(self.average_actor)
 
     def other_policies(self) -> dict[str, Policy]:
-        """Return policies to evaluate beside the actor, by column of `progress.csv`."""
+        """Return further policies to evaluate, by the names of their columns in `progress.csv`."""
         return {}
 
     def plain(self, network: MLP) -> Actor:
-        """Return a copy of the actor on the CPU with the weights of this network."""
+        """Return an `Actor` on the CPU with the weights of `network` and the newest normalizers."""
         actor = copy.deepcopy(self.actor)
         actor.network.load_state_dict(network.state_dict())
         return actor.cpu().eval()
 
     def modules(self) -> dict[str, nn.Module]:
-        """Return the modules that a training state contains, by name."""
+        """Return the modules to save in the training state, by name."""
         return {'actor': self.actor, 'critic': self.critic, 'average_actor': self.average_actor}
 
     def optimizers(self) -> dict[str, torch.optim.Adam]:
-        """Return the optimizers whose states a training state contains, by name."""
+        """Return the optimizers to save in the training state, by name."""
         return {
             'actor_optimizer': self.actor_optimizer,
             'critic_optimizer': self.critic_optimizer,
         }
 
     def set_progress(self, progress: float) -> None:
-        """Set the learning rate for this progress of the run, 0 ... 1."""
+        """Set the learning rate for this progress of the run; `progress` is clipped to 0 ... 1."""
         config, share = self.config, min(max(progress, 0.0), 1.0)
         rate = config.learning_rate * (1.0 - share * (1.0 - config.final_learning_rate))
         for optimizer in (self.actor_optimizer, self.critic_optimizer):
             optimizer.param_groups[0]['lr'] = rate
 
     def tensor(self, values: object) -> Tensor:
-        """Return values of a batch as a tensor on the device of the networks."""
+        """Return an array of a batch as a tensor on the device of the networks."""
         return torch.as_tensor(values).to(self.device, non_blocking=True)
 
 
 def network_shape(config: TrainConfig, extra_actions: int = 0) -> NetworkShape:
-    """Return the shape of actor and critic."""
+    """Return the sizes and inputs of the networks for a task.
+
+    `extra_actions` is the number of actor outputs beside the robot's action.
+    """
     spec = task_spec(config.task)
     return NetworkShape(
         observation_size=spec.observation_size,
@@ -137,7 +150,11 @@ def network_shape(config: TrainConfig, extra_actions: int = 0) -> NetworkShape:
 
 
 def with_inputs(tensors: dict[str, Tensor], column: int, count: int) -> dict[str, Tensor]:
-    """Return networks with `count` more inputs from `column` on; their weights are zero."""
+    """Insert `count` inputs at index `column` into the first layers of saved networks.
+
+    `tensors` are the networks by parameter name. The new weights are zero, so outputs do not
+    change.
+    """
     changed = {}
     for name in first_weights(tensors):
         weight = tensors[name]
@@ -147,5 +164,5 @@ def with_inputs(tensors: dict[str, Tensor], column: int, count: int) -> dict[str
 
 
 def first_weights(tensors: dict[str, Tensor]) -> list[str]:
-    """Return the names of the weights of layers that take the inputs."""
+    """Return the names of the weights in `tensors` that multiply network inputs."""
     return [name for name in tensors if name.endswith('hidden.0.weight')]

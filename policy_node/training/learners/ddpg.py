@@ -23,7 +23,11 @@ _ALWAYS = ('observation', 'next_observation', 'goal', 'action', 'reward', 'disco
 
 @dataclass(frozen=True, slots=True)
 class TensorBatch:
-    """A batch as tensors, with the network inputs of states and next states."""
+    """A batch as tensors on the device of the networks.
+
+    `features` and `next_features` are the network inputs from observation, or next observation, and
+    goal.
+    """
 
     observation: Tensor
     next_observation: Tensor
@@ -36,9 +40,10 @@ class TensorBatch:
 
 
 class Critic(nn.Module):
-    """Action value of normalized features and an action in [-1, 1].
+    """Network that returns the action value of features and an action in [-1, 1].
 
     Args:
+        inputs: Number of features plus action size.
         shape: Shape of the actor; the hidden layers are the same.
         outputs: Number of outputs, whose mean is the value.
     """
@@ -48,7 +53,7 @@ class Critic(nn.Module):
         self.network = MLP(inputs, outputs, shape)
 
     def forward(self, features: Tensor, action: Tensor) -> Tensor:
-        """Return values (batch,), float32."""
+        """Return action values (batch,), float32: the mean of the outputs."""
         values = self.outputs(features, action)
         return values.squeeze(-1) if values.shape[-1] == 1 else values.mean(dim=-1)
 
@@ -59,37 +64,43 @@ class Critic(nn.Module):
 
 
 class CriticLoss:
-    """One critic and its squared errors. Studies replace it (`research/critics.py`)."""
+    """Makes the critic and computes its loss: one critic, squared errors.
+
+    Studies replace this class (`research/critics.py`).
+    """
 
     def make(self, features: int, shape: NetworkShape) -> nn.Module:
-        """Return a new critic of features of this length."""
+        """Return a new critic for `features` network inputs."""
         return Critic(features + shape.action_size, shape)
 
     def costs(self, learner: DDPG, batch: TensorBatch) -> Tensor:
-        """Return the cost of each transition, (batch,) or (critics, batch)."""
+        """Return the loss of each transition, (batch,) or (critics, batch)."""
         return self.errors(learner, batch).square()
 
     def errors(self, learner: DDPG, batch: TensorBatch) -> Tensor:
-        """Return values minus targets, (batch,) or (critics, batch)."""
+        """Return the critic's values minus their targets, (batch,) or (critics, batch)."""
         with torch.no_grad():
             target = learner.targets(batch.reward, batch.discount, batch.next_features)
         error: Tensor = learner.critic(batch.features, batch.action) - target
         return error
 
     def pooled(self, values: Tensor) -> Tensor:
-        """Return the values of all critics as one, (batch,)."""
+        """Combine the values of several critics into one per transition, (batch,).
+
+        With one critic, `values` is returned unchanged.
+        """
         return values
 
 
 class TargetNetworks:
-    """Slow copies of actor and critic, from which targets are computed."""
+    """Target networks: copies of actor and critic that follow them slowly."""
 
     def __init__(self, actor: MLP, critic: nn.Module) -> None:
         self.actor, self.critic = copy.deepcopy(actor), copy.deepcopy(critic)
 
     @torch.no_grad()
     def move(self, learner: DDPG) -> None:
-        """Move the copies towards the networks by the share 1 - `polyak`."""
+        """Move the target networks towards the networks of `learner` by the share 1 - `polyak`."""
         weight = 1.0 - learner.config.polyak
         copies = learner.target_actor, learner.target_critic
         old: list[Tensor] = [each for network in copies for each in network.parameters()]
@@ -97,24 +108,24 @@ class TargetNetworks:
         torch._foreach_lerp_(old, new, weight)
 
     def modules(self) -> dict[str, nn.Module]:
-        """Return the modules that a training state contains, by name."""
+        """Return the target networks to save in the training state, by name."""
         return {'target_actor': self.actor, 'target_critic': self.critic}
 
 
 @dataclass(frozen=True, slots=True)
 class Parts:
-    """Exchangeable parts of `DDPG`."""
+    """Exchangeable parts of `DDPG`: the loss of the critic and the class of target networks."""
 
     critic_loss: CriticLoss = field(default_factory=CriticLoss)
     targets: type[TargetNetworks] = TargetNetworks
 
 
 class DDPG(ActorCritic):
-    """Actor, critic, their slow copies, and one update.
+    """Learner of deep deterministic policy gradient, with target networks.
 
     Args:
-        workers: This worker among all; gradients are averaged over all.
-        parts: Exchangeable parts; None is those of the paper.
+        workers: Processes that train together; gradients are averaged over them.
+        parts: Exchangeable parts; None takes those of the paper.
     """
 
     def __init__(
@@ -139,13 +150,16 @@ class DDPG(ActorCritic):
         self._set_up(shape)
 
     def _set_up(self, shape: NetworkShape) -> None:
-        """Make what only a subclass has."""
+        """Do nothing; a subclass creates its additional networks here, at the end of `__init__`."""
 
     def _make_networks(self, shape: NetworkShape) -> tuple[Actor, nn.Module]:
         return Actor(shape), self.critic_loss.make(shape.feature_size, shape)
 
     def update(self, batch: Transitions) -> Losses:
-        """Improve the critic, the actor and, when due, move the target networks."""
+        """Update the critic; update the actor and the target networks at their intervals.
+
+        Return the losses; the actor's loss and value come from its last update.
+        """
         tensors = self.tensors(batch)
         critic_loss = self._update_critic(tensors)
         if self.updates % self.config.policy_delay == 0:
@@ -156,7 +170,7 @@ class DDPG(ActorCritic):
         return Losses(critic_loss, *self._of_actor)
 
     def tensors(self, batch: Transitions) -> TensorBatch:
-        """Return a batch as tensors, with the network inputs of states and next states."""
+        """Convert a batch to tensors and compute the network inputs of both states."""
         observation, next_observation, goal, action, reward, discount = (
             self.tensor(getattr(batch, name)) for name in _ALWAYS
         )
@@ -166,20 +180,23 @@ class DDPG(ActorCritic):
         return TensorBatch(*states, action, reward, discount)
 
     def targets(self, reward: Tensor, discount: Tensor, next_features: Tensor) -> Tensor:
-        """Return targets (batch,) from reward, discount and the features of the next state."""
+        """Return the targets of the critic, (batch,), from the target networks."""
         next_action = self.target_action(next_features)
         return self.bootstrap(reward, discount, self.target_critic(next_features, next_action))
 
     def target_action(self, next_features: Tensor) -> Tensor:
-        """Return the actions of the target actor."""
+        """Return the actions (batch, action_size) of the target actor, in [-1, 1]."""
         return torch.tanh(self.target_actor(next_features))
 
     def bootstrap(self, reward: Tensor, discount: Tensor, next_value: Tensor) -> Tensor:
-        """Return targets (batch,). Episodes are cut, not terminated: each next state counts."""
+        """Return targets (batch,): reward + discount * next value, clipped.
+
+        Episodes are cut by time, not terminated, so the value of the last state counts too.
+        """
         return self.clipped(reward + discount * self.critic_loss.pooled(next_value))
 
     def clipped(self, target: Tensor) -> Tensor:
-        """Return targets clipped to the range of returns of rewards in [-1, 0]."""
+        """Return targets clipped to the possible returns if all rewards are in [-1, 0]."""
         return target.clamp(self.config.lowest_value, 0.0)
 
     def _update_critic(self, batch: TensorBatch) -> Tensor:
@@ -201,12 +218,12 @@ class DDPG(ActorCritic):
         return loss.detach(), value.detach()
 
     def _value(self, features: Tensor, action: Tensor) -> Tensor:
-        """Return the mean value that the actor maximizes."""
+        """Return the mean value of the actor's actions, which the actor maximizes; a scalar."""
         value: Tensor = self.critic(features, action).mean()
         return value
 
     def _penalty(self, batch: TensorBatch, action: Tensor) -> Tensor:
-        """Return the cost of the actor's actions, which is subtracted from their value."""
+        """Return the term that is added to the actor's loss: the mean squared action, weighted."""
         del batch
         cost: Tensor = self.config.action_l2 * action.float().square().mean()
         return cost
@@ -222,9 +239,9 @@ class DDPG(ActorCritic):
         return action
 
     def modules(self) -> dict[str, nn.Module]:
-        """Return the modules that a training state contains, by name."""
+        """Return the modules to save in the training state, by name."""
         return {**super().modules(), **self._targets.modules()}
 
     def precision(self) -> contextlib.AbstractContextManager[None]:
-        """Return a context in which matrix products have the precision of the run."""
+        """Return a context in which matrix products use bfloat16 if the run does."""
         return torch.autocast(self.device.type, torch.bfloat16, enabled=self._bfloat16)

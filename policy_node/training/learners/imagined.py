@@ -1,16 +1,16 @@
-"""Imagined subgoals, halfway by value, as a prior on the actor.
+"""Imagined subgoals, halfway to the goal by value, as a prior on the actor.
 
 Chane-Sane et al. 2021, "Goal-Conditioned Reinforcement Learning with Imagined Subgoals" (RIS, arXiv
-2107.00541): the action for a distant goal should be near the action for a goal on the way, which
-the actor learns sooner. A network h imagines that subgoal. For a state s and a goal g it learns, of
-several visited states s', those with the least
+2107.00541). The actor learns near goals before distant ones. So its action for a distant goal is
+drawn towards its action for a subgoal on the way. A network h imagines that subgoal. For a state s
+and a goal g, h learns from several visited states s'. The best ones have the least
 
     cost(s') = max(-V(s, g'), -V(s', g)),     g' is the goal achieved in s',
 
-weighted by the softmax of -cost. The loss of the actor gets the mean of (a - a')^2 times
+and their weights are the softmax of -cost. The loss of the actor gets the mean of (a - a')^2 times
 `subgoal_prior`; a' is the action of the target actor for h(s, g). As in RIS the acting policy does
-not use h. Here the weights compare the candidates of a state with each other, not with h, so V is
-evaluated only for visited states.
+not use h. Unlike RIS, the weights compare the candidates of a state with each other, not with h. So
+V is evaluated only for visited states.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ _TEMPERATURE = 1.0
 
 
 class ImaginingDDPG(DDPG):
-    """`DDPG` with a prior on the actor: its actions for imagined subgoals. Arguments as `DDPG`.
+    """`DDPG` whose actor is drawn towards its actions for imagined subgoals. Arguments as `DDPG`.
 
     Attributes:
-        imagination: Network from features of a state and a goal to a normalized subgoal.
+        imagination: Network from the features of a state and its goal to a normalized subgoal.
     """
 
     def _set_up(self, shape: NetworkShape) -> None:
@@ -78,13 +78,13 @@ class ImaginingDDPG(DDPG):
         return loss
 
     def _values(self, observation: Tensor, goal: Tensor) -> Tensor:
-        """Return values (batch,) of states, averaged over critics."""
+        """Return the values (batch,) of states and goals under the actor, averaged over critics."""
         features = self.actor.features(observation, goal)
         value: Tensor = self.critic(features, self.actor(features))
         return value if value.ndim == 1 else value.mean(dim=0)
 
     def _penalty(self, batch: TensorBatch, action: Tensor) -> Tensor:
-        """As `DDPG`, plus the distance between actions and those for imagined subgoals."""
+        """Return the action cost of `DDPG` plus a cost of the distance to actions for subgoals."""
         with torch.no_grad():
             features = self.actor.features(batch.observation, self.imagine(batch.features))
             prior = torch.tanh(self.target_actor(features))
@@ -92,7 +92,10 @@ class ImaginingDDPG(DDPG):
         return super()._penalty(batch, action) + self.config.subgoal_prior * distance
 
     def imagine(self, features: Tensor) -> Tensor:
-        """Return subgoals (batch, goal_size) in units of the task from features (batch, size)."""
+        """Return subgoals (batch, goal_size) for features (batch, size), in the units of goals.
+
+        The quaternion of a pose is normalized.
+        """
         normalizer = self.actor.goal_normalizer
         subgoal: Tensor = normalizer.mean + normalizer.std * self.imagination(features)
         if not self._is_pose:
@@ -101,9 +104,9 @@ class ImaginingDDPG(DDPG):
         return torch.cat([subgoal[:, :3], rotation], dim=-1)
 
     def modules(self) -> dict[str, nn.Module]:
-        """Return the modules that a training state contains, by name."""
+        """Return the modules to save in the training state, by name."""
         return {**super().modules(), 'imagination': self.imagination}
 
     def optimizers(self) -> dict[str, torch.optim.Adam]:
-        """Return the optimizers whose states a training state contains, by name."""
+        """Return the optimizers to save in the training state, by name."""
         return {**super().optimizers(), 'imagination_optimizer': self._imagination_optimizer}
