@@ -7,6 +7,7 @@ import math
 import os
 import pkgutil
 import signal
+import struct
 import sys
 import tempfile
 import time
@@ -14,7 +15,7 @@ from collections.abc import Callable, Iterator, MutableMapping, Sequence
 from contextlib import contextmanager, suppress
 from itertools import pairwise
 from types import FrameType
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from msgs_spec.parameters import usage
 from msgs_spec.text import one_line
@@ -90,16 +91,6 @@ class StopSignals:
         return lambda: self._received_at >= earliest
 
 
-class RunnableNode(Protocol):
-    """A node that runs until its work is done or a signal stops it."""
-
-    def run(self, stop: StopSignals) -> None:
-        """Run."""
-
-    def destroy_node(self) -> None:
-        """Close topics and services."""
-
-
 def node_main(
     name: str,
     summary: str,
@@ -108,65 +99,39 @@ def node_main(
     shared_memory: bool = False,
     second_signal_ends: bool = False,
 ) -> int:
-    """Run a node of `NODES` as a process, or print its help; return the exit code of `run_node`."""
+    """Run a node of `NODES` as a process, or print its help; return the exit code of `run_node`.
+
+    `node_class` names a class, as `package.module:Class`. It has the methods `run(stop)` and
+    `destroy_node()`, and a ValueError in its constructor is wrong usage.
+    """
     given = sys.argv[1:] if args is None else args
     if '-h' in given or '--help' in given:
-        return run_command(name, lambda: _print_usage(name, summary))
+        return run_command(name, lambda: print(usage(name, summary)) or EXIT_SUCCESS)
 
     def run(stop: StopSignals) -> None:
         stop.second_ends = second_signal_ends
-        _run(node_class, stop)
+        make_node: Callable[[], Any] = pkgutil.resolve_name(node_class)
+        if stop:
+            return
+        try:
+            node = make_node()
+        except ValueError as error:
+            raise UsageError(one_line(error, _LONGEST_LINE)) from error
+        try:
+            node.run(stop)
+        finally:
+            destroy(node)
 
     return run_node(name, run, args, shared_memory)
 
 
-def _print_usage(name: str, summary: str) -> int:
-    print(usage(name, summary))
-    return EXIT_SUCCESS
-
-
-def _run(node_class: str, stop: StopSignals) -> None:
-    make_node: Callable[[], RunnableNode] = pkgutil.resolve_name(node_class)
-    if stop:
-        return
-    try:
-        node = make_node()
-    except ValueError as error:
-        raise UsageError(one_line(error, _LONGEST_LINE)) from error
-    try:
-        node.run(stop)
-    finally:
-        destroy(node)
-
-
-def destroy(node: RunnableNode | Node, exit_code: int | None = None) -> None:
+def destroy(node: Node, exit_code: int | None = None) -> None:
     """Destroy a node whose work is done; end the process if that takes longer than 10 s."""
     error = sys.exception()
     if exit_code is None:
         exit_code = EXIT_SUCCESS if error is None else getattr(error, 'exit_code', EXIT_FAILURE)
     with ends_within(_DESTROY_SECONDS, exit_code):
         node.destroy_node()
-
-
-class _SignalEvent(ctypes.Structure):
-    """`struct sigevent` of glibc on 64-bit machines: 64 bytes."""
-
-    _fields_ = (
-        ('value', ctypes.c_void_p),
-        ('signal', ctypes.c_int),
-        ('notify', ctypes.c_int),
-        ('function', ctypes.c_void_p),
-        ('attributes', ctypes.c_void_p),
-        ('padding', ctypes.c_char * 32),
-    )
-
-
-class _TimerSpec(ctypes.Structure):
-    """`struct itimerspec`: seconds and nanoseconds of the interval and of the first expiry."""
-
-    _fields_ = tuple(
-        (name, ctypes.c_long) for name in ('interval_s', 'interval_ns', 'first_s', 'first_ns')
-    )
 
 
 @contextmanager
@@ -181,18 +146,19 @@ def ends_within(seconds: float, exit_code: int) -> Iterator[None]:
     for stream in filter(None, (sys.stdout, sys.stderr)):
         with suppress(OSError, ValueError):
             stream.flush()
-    library = ctypes.CDLL(None)
-    timer = ctypes.c_void_p()
+    library, timer = ctypes.CDLL(None), ctypes.c_void_p()
     # `_exit` takes its argument where a notification function finds the value.
-    leave = ctypes.cast(library._exit, ctypes.c_void_p)
-    event = _SignalEvent(value=exit_code, notify=_SIGEV_THREAD, function=leave)
+    leave = ctypes.cast(library._exit, ctypes.c_void_p).value
+    # `struct sigevent` of 64-bit glibc: value, signal, notification, function, attributes.
+    event = struct.pack('PiiPP32x', exit_code, 0, _SIGEV_THREAD, leave, 0)
     is_armed = (
         hasattr(library, 'gnu_get_libc_version')
-        and library.timer_create(_CLOCK_MONOTONIC, ctypes.byref(event), ctypes.byref(timer)) == 0
+        and library.timer_create(_CLOCK_MONOTONIC, event, ctypes.byref(timer)) == 0
     )
     if is_armed:
-        first = _TimerSpec(first_s=int(seconds), first_ns=int(seconds % 1 * 1e9))
-        library.timer_settime(timer, 0, ctypes.byref(first), None)
+        # `struct itimerspec`: the interval and the first expiry, in seconds and nanoseconds.
+        expiry = struct.pack('4l', 0, 0, int(seconds), int(seconds % 1 * 1e9))
+        library.timer_settime(timer, 0, expiry, None)
     try:
         yield
     finally:

@@ -69,18 +69,16 @@ class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32
             ValueError: If an option is unknown or the goal is invalid.
             gymnasium.error.Error: If the seed is no integer or negative.
         """
-        asked, given = self._read_options(options, np.ones(1, dtype=bool))
+        given = self._read_options(options, np.ones(1, dtype=bool))
         super().reset(seed=seed)
         self._physics.send()
         self.simulation.goals = self.simulation.goals.copy()
         draws_goals = self._draws_goals()
         observation = _first(self.simulation.reset(seed=[self.np_random], **given))
         self._physics.receive()
-        if asked is not None:
-            self.simulation.set_goal(asked)
-        elif not draws_goals:
+        if not draws_goals and given['goal'] == [None]:
             self.goal = self._sample_goal()
-        if asked is not None or not draws_goals or self.overrides('_get_obs'):
+        if not draws_goals or self.overrides('_get_obs'):
             observation = self._get_obs()
         self._show()
         return observation, {}
@@ -230,8 +228,8 @@ class SharedPhysics:
     access.
     """
 
-    # Values of the model when it was first shared, where its physics vary.
-    _unchanged: dict[str, NDArray[Any]] | None = None
+    # The model when it was first shared, if its physics vary.
+    _unchanged: bytes | None = None
 
     def __init__(self, simulation: Simulation) -> None:
         """Shares the first copy of a simulation that keeps its data."""
@@ -243,7 +241,7 @@ class SharedPhysics:
     def model(self) -> mujoco.MjModel:
         """The compiled model, always the same object."""
         if not self._shares_model and self._simulation.varies_physics:
-            self._unchanged = _values(self._simulation.model)
+            self._unchanged = _saved(self._simulation.model)
         self._shares_model = True
         return self._simulation.model
 
@@ -267,24 +265,22 @@ class SharedPhysics:
 
     def move_sites(self, sites: list[int], positions: Array) -> None:
         """Move sites (n,) of the model to (n, 3) in m that only pictures show."""
-        site_pos = self._simulation.model.site_pos
-        site_pos[sites] = positions
-        if self._unchanged is not None:
-            self._unchanged['MjModel.site_pos'] = site_pos.copy()
+        is_unchanged = self._is_unchanged()
+        self._simulation.model.site_pos[sites] = positions
+        if is_unchanged:
+            self._unchanged = _saved(self._simulation.model)
+
+    def _is_unchanged(self) -> bool:
+        if self._unchanged is None or not self._simulation.varies_physics:
+            return False
+        return self._unchanged == _saved(self._simulation.model)
 
     def send(self) -> None:
         """Takes over what was written; to be called before anything is computed."""
-        if self._shares_model:
-            self._send_model()
+        if self._shares_model and not self._is_unchanged():
+            self._simulation.apply_model_changes()
         if self._data is not None:
             self._simulation.write_data(0, self._data)
-
-    def _send_model(self) -> None:
-        if self._unchanged is not None and self._simulation.varies_physics:
-            model = self._simulation.model
-            if all(np.array_equal(now, self._unchanged[n]) for n, now in _values(model).items()):
-                return
-        self._simulation.apply_model_changes()
 
     def receive(self) -> None:
         """Shows what was computed."""
@@ -296,12 +292,8 @@ class SharedPhysics:
         return self.__dict__ | {'_data': None}
 
 
-def _values(model: mujoco.MjModel) -> dict[str, NDArray[Any]]:
-    """Return copies of the arrays of a model and of its options."""
-    found = {}
-    for owner in (model, model.opt):
-        for name in dir(owner):
-            value = None if name.startswith('_') else getattr(owner, name)
-            if isinstance(value, (np.ndarray, float, int)):
-                found[f'{type(owner).__name__}.{name}'] = np.array(value)
-    return found
+def _saved(model: mujoco.MjModel) -> bytes:
+    """Return the bytes of a model."""
+    buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
+    mujoco.mj_saveModel(model, None, buffer)
+    return buffer.tobytes()

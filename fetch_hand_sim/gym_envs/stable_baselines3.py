@@ -14,7 +14,6 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvS
 from fetch_hand_sim.gym_envs.task_attributes import RESET_OPTIONS
 from fetch_hand_sim.gym_envs.vector_env import FetchHandVectorEnv
 from fetch_hand_sim.simulation import Observation
-from fetch_hand_sim.simulation.arguments import finite_numbers
 from msgs_spec.text import entries
 
 
@@ -50,22 +49,11 @@ class FetchHandVecEnv(VecEnv):
         """
         options = self._options
         self._reset_options()
-        spec, goals = self.batch.spec_of_task, {}
-        for index, each in enumerate(options):
-            if 'goal' in entries('options', each, RESET_OPTIONS):
-                size = (spec.goal.size,)
-                goals[index] = finite_numbers(f'goal of {spec.name}', each['goal'], size)
-        given = {
-            name: [each.get(name) for each in options]
-            for name in ('variation', 'start')
-            if any(name in each for each in options)
-        }
+        named = [entries('options', each, RESET_OPTIONS) for each in options]
+        given = {name: [each.get(name) for each in named] for name in RESET_OPTIONS}
         seeds = None if all(seed is None for seed in self._seeds) else self._seeds
         observation, _ = self.batch.reset(seed=seeds, options=given)
         self._reset_seeds()
-        if goals:
-            self.batch.simulation.set_goal(list(goals.values()), list(goals))
-            observation |= self.batch.simulation.observe()
         return observation
 
     def step_async(self, actions: NDArray[np.float32]) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Mapping
 from dataclasses import replace
+from itertools import compress
 from numbers import Real
 from typing import Any, Self
 
@@ -16,11 +17,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from fetch_hand_sim.gym_envs.pictures import Pictures
 from fetch_hand_sim.simulation import Simulation
-from fetch_hand_sim.simulation.arguments import finite_numbers, nearest_quaternions
+from fetch_hand_sim.simulation.arguments import each_of
 from fetch_hand_sim.simulation.rendering import HEIGHT, WIDTH
-from msgs_spec.arrays import Array
 from msgs_spec.disturbances import Disturbances
-from msgs_spec.tasks import DEFAULT_CONTROL_HZ, GoalKind, RewardType, SuccessRule, TaskSpec
+from msgs_spec.tasks import DEFAULT_CONTROL_HZ, RewardType, SuccessRule, TaskSpec
 from msgs_spec.text import entries, one_line, one_of
 
 # Metres or radians.
@@ -198,37 +198,19 @@ class TaskAttributes:
 
     def _read_options(
         self, options: Any, mask: NDArray[np.bool_], *others: str
-    ) -> tuple[Array | None, dict[str, Any]]:
-        """Return what options of `reset` ask for, checked before anything has moved.
+    ) -> dict[str, list[Any]]:
+        """Return goal, variation and start, as `Simulation.reset` takes them, or raise ValueError.
 
         Args:
-            options: A dictionary or None. `goal`: (goal size,) for all or (N, goal size).
-                `variation` and `start`: one for all, or a list of N.
+            options: A dictionary or None. Each of the three is one for all, or a list of N.
             mask: (N,) which environments start.
             others: Names of further options.
-
-        Returns:
-            Goals (n, goal size) of the n that start, or None where they are drawn; `variation` and
-            `start` for `Simulation.reset`.
         """
         given = entries('options', {} if options is None else options, (*RESET_OPTIONS, *others))
-        spec, goals = self.spec_of_task, None
-        if 'goal' in given:
-            one = (spec.goal.size,)
-            shape = (mask.size, *one)
-            goal = finite_numbers(f'goal of {spec.name}', given['goal'], one, shape)
-            goals = np.array(np.broadcast_to(goal, shape)[mask], dtype=np.float64)
-            if spec.goal is GoalKind.POSE:
-                goals = nearest_quaternions(goals, goals)
-        found = {}
-        for name in ('variation', 'start'):
-            value = given.get(name)
-            if isinstance(value, list | tuple):
-                if len(value) != mask.size:
-                    raise ValueError(f'{name}: {len(value)} values; allowed: one, or {mask.size}')
-                value = [each for each, starts in zip(value, mask, strict=True) if starts]
-            found[name] = value
-        return goals, found
+        return {
+            name: list(compress(each_of(name, given.get(name), mask.size), mask))
+            for name in RESET_OPTIONS
+        }
 
 
 def observation_space(spec: TaskSpec) -> spaces.Space[Any]:

@@ -129,16 +129,13 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
             raise gymnasium.error.ResetNeeded(
                 f'the first reset is one of all; reset_mask leaves out {waiting.tolist()!s:.60}'
             )
-        goals, given = self._read_options(options, mask, 'reset_mask')
+        given = self._read_options(options, mask, 'reset_mask')
         ids = np.flatnonzero(mask)
         seeds = self._each_seed(seed)
         observation = self.simulation.reset(seed=[seeds[i] for i in ids.tolist()], ids=ids, **given)
         for index in ids.tolist():
             if seeds[index] is not None:
                 self._seeds[index] = seeds[index]
-        if goals is not None:
-            self.simulation.set_goal(goals, ids)
-            observation = self.simulation.observe()
         self._elapsed[mask] = 0
         self._ended[mask] = False
         return self._ordered(observation), {}

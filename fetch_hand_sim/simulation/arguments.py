@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from numbers import Real
 from typing import Any
 
 import mujoco
@@ -59,6 +60,22 @@ def nearest_quaternions(goals: Array, achieved_goals: Array) -> Array:
     quaternions = goals[:, 3:] / norm
     quaternions[(quaternions * achieved_goals[:, 3:]).sum(axis=1) < 0.0] *= -1.0
     return np.concatenate([goals[:, :3], quaternions], axis=1)
+
+
+def each_of(name: str, given: Any, count: int) -> list[Any]:
+    """Return a value or None for each of `count` simulations.
+
+    `given` is one value for all, or a list or rows with one for each; ValueError for another number
+    of them. A goal that is a list of numbers is one value.
+    """
+    is_list = isinstance(given, list | tuple)
+    if is_list and name == 'goal':
+        is_list = not all(isinstance(part, Real) for part in given)
+    is_rows = isinstance(given, np.ndarray) and given.ndim == 2
+    each = list(given) if is_list or is_rows else [given] * count
+    if len(each) != count:
+        raise ValueError(f'{name}: {len(each)} values; allowed: one, or {count}')
+    return each
 
 
 def selected_simulations(ids: ArrayLike, num_envs: int) -> NDArray[np.intp]:

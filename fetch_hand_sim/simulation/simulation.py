@@ -26,6 +26,7 @@ from numpy.typing import ArrayLike, NDArray
 from fetch_hand_sim.simulation.arguments import (
     Seeds,
     StartState,
+    each_of,
     finite_numbers,
     generators,
     nearest_quaternions,
@@ -226,6 +227,7 @@ class Simulation:
         ids: ArrayLike | None = None,
         variation: EachGiven = None,
         start: EachGiven = None,
+        goal: ArrayLike | Sequence[ArrayLike | None] | None = None,
     ) -> Observation:
         """Start new episodes.
 
@@ -240,14 +242,16 @@ class Simulation:
             start: Start states in place of drawn ones, likewise: a mapping with some of `joints`,
                 `joint_velocities` (numbers by name, or all in the order of `joint_states`; rad or
                 m), `object_pose` (7,) and `object_velocity` (6,). Velocities of what is placed are
-                zero unless given. Goals stay those of the seed; `disturbances` may shift the start.
+                zero unless given; `disturbances` may shift the start.
+            goal: Desired goals in place of drawn ones, as `set_goal` takes them: (goal size,) for
+                all, or one or None for each simulation of `ids`. The other draws stay.
 
         Returns:
             The observations of all N simulations.
 
         Raises:
             ValueError: If a seed is invalid, ids or seeds do not match the simulations, or a
-                variation or start is unknown or impossible; nothing has moved then.
+                variation, start or goal is unknown or impossible; nothing has moved then.
             RuntimeError: If the object never stays on the palm, or this process was forked and
                 lacks the threads of the batch.
         """
@@ -256,11 +260,14 @@ class Simulation:
         starts = self._each_given(
             'start', start, selected, lambda each: read_start(each, self._task)
         )
+        goals = self._each_given('goal', goal, selected, self._read_goal)
         fresh = generators(seed, selected)
         for index, generator in zip(selected.tolist(), fresh, strict=True):
             self._generators[index] = generator or self._generators[index]
         if selected.size:
             self._start(np.sort(selected), given, starts)
+        if goals:
+            self.set_goal(list(goals.values()), list(goals))
         return self.observe()
 
     def step(self, actions: ArrayLike) -> StepResult:
@@ -437,14 +444,18 @@ class Simulation:
         self._is_started[:] = state['is_started']
 
     def _each_given(
-        self, name: str, given: EachGiven, ids: NDArray[np.intp], read: Callable[[Any], _Read]
+        self, name: str, given: Any, ids: NDArray[np.intp], read: Callable[[Any], _Read]
     ) -> dict[int, _Read]:
         """Return what is given for single simulations, read and checked."""
-        each = list(given) if isinstance(given, list | tuple) else [given] * ids.size
-        if len(each) != ids.size:
-            raise ValueError(f'{name}: {len(each)} values; allowed: one, or {ids.size}')
-        pairs = zip(ids.tolist(), each, strict=True)
+        pairs = zip(ids.tolist(), each_of(name, given, ids.size), strict=True)
         return {index: read(value) for index, value in pairs if value is not None}
+
+    def _read_goal(self, goal: ArrayLike) -> Array:
+        shape = (self.spec.goal.size,)
+        wanted = np.array(finite_numbers(f'goal of {self.spec.name}', goal, shape), np.float64)
+        if self.spec.goal is GoalKind.POSE:
+            nearest_quaternions(wanted[None], wanted[None])
+        return wanted
 
     def _allowed_variation(self, variation: Any) -> dict[str, float]:
         if self._disturber is None:

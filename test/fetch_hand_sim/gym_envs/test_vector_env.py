@@ -256,7 +256,7 @@ def test_episodes_have_the_goals_that_their_reset_was_given():
     observation, _ = env.reset(options={'reset_mask': mask, 'goal': goals})
     assert observation['desired_goal'].tolist() == [[1.3, 0.7, 0.6], [3, 4, 5], [6, 7, 8]]
     before = state_of(env)
-    with pytest.raises(ValueError, match=r'shape \(2, 3\) given; .* \(3,\) or \(3, 3\)'):
+    with pytest.raises(ValueError, match='goal: 2 values; allowed: one, or 3'):
         env.reset(options={'reset_mask': mask, 'goal': goals[1:]})
     assert state_of(env) == before
 
