@@ -25,23 +25,11 @@ _NAMED = 4
 Readings = Mapping[str, Array]
 
 
-def observed_topics(task: TaskSpec) -> tuple[str, ...]:
-    """Return the names of the topics that the observation of a task depends on."""
-    if task.formulas is not None:
-        return task.formulas.topics
-    if task.goal is GoalKind.FINGERTIPS:
-        return ('joint_states', 'fingertip_poses')
-    if task.goal is GoalKind.POSE:
-        return ('joint_states', 'object_joint')
-    robot = ('joint_states', 'end_effector_pose', 'end_effector_twist')
-    return (*robot, 'object_pose', 'object_twist') if task.has_object else robot
-
-
 def observation(task: TaskSpec, readings: Readings, tick_duration: float) -> Array:
     """Return observation vectors (..., task.observation_size); `task.observation` names the parts.
 
-    `readings` contain at least the `observed_topics`, with unit quaternions. `tick_duration` is one
-    control period, s.
+    `readings` contain at least `task.observed_topics`, with unit quaternions. `tick_duration` is
+    one control period, s.
     """
     if task.formulas is not None:
         return task.formulas.observation(readings, tick_duration)
@@ -112,7 +100,7 @@ class ObservationAssembler:
     def __init__(self, task: TaskSpec, control_hz: float) -> None:
         self._task = task
         self._tick_duration = substeps_per_tick(control_hz) * PHYSICS_TIMESTEP
-        names = (*observed_topics(task), 'achieved_goal', 'desired_goal')
+        names = (*task.observed_topics, 'achieved_goal', 'desired_goal')
         self.topics = tuple(topic(task, name) for name in names)
 
     def assemble(self, vectors: Readings) -> dict[str, Array]:

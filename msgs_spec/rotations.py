@@ -95,20 +95,6 @@ def matrix_to_euler(matrix: ArrayLike) -> Array:
     return np.stack([x, y, z], axis=-1)
 
 
-def euler_to_matrix(euler: ArrayLike) -> Array:
-    """Return rotation matrices (..., 3, 3) of Euler angles xyz (..., 3), rad."""
-    x, y, z = _parts(euler)
-    si, sj, sk = np.sin(-z), np.sin(-y), np.sin(-x)
-    ci, cj, ck = np.cos(-z), np.cos(-y), np.cos(-x)
-    cc, cs, sc, ss = ci * ck, ci * sk, si * ck, si * sk
-    rows = [
-        [cj * ci, cj * si, -sj],
-        [sj * cs - sc, sj * ss + cc, cj * sk],
-        [sj * cc + ss, sj * sc - cs, cj * ck],
-    ]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
-
-
 def euler_to_quaternion(euler: ArrayLike) -> Array:
     """Return quaternions wxyz (..., 4) of Euler angles xyz (..., 3), rad."""
     x, y, z = _parts(euler)

@@ -136,6 +136,18 @@ class TaskSpec:
         """True if the task has an object."""
         return self.object_name is not None
 
+    @property
+    def observed_topics(self) -> tuple[str, ...]:
+        """Names of the topics that the observation depends on."""
+        if self.formulas is not None:
+            return self.formulas.topics
+        if self.goal is GoalKind.FINGERTIPS:
+            return ('joint_states', 'fingertip_poses')
+        if self.goal is GoalKind.POSE:
+            return ('joint_states', 'object_joint')
+        robot = ('joint_states', 'end_effector_pose', 'end_effector_twist')
+        return (*robot, 'object_pose', 'object_twist') if self.has_object else robot
+
     def with_joint_prefix(self, prefix: str) -> TaskSpec:
         """Return the task with another prefix of its joint names."""
         if prefix == JOINT_PREFIX:

@@ -115,19 +115,13 @@ class EpisodeStatus:
                     f'episode_status with unreadable value: {name}={text[:40]!r}'
                 ) from None
         status = cls(**found)
-        status._require_known()
-        return status
-
-    def _require_known(self) -> None:
-        """Raise ValueError for values that no node can follow."""
         try:
-            substeps_per_tick(self.control_hz)
+            substeps_per_tick(status.control_hz)
         except ValueError as error:
             raise ValueError(f'episode_status with {error}') from None
-        if len(self.joint_prefix) > LONGEST_JOINT_PREFIX:
-            raise ValueError(
-                f'episode_status with joint_prefix of {len(self.joint_prefix)} characters'
-            )
+        if (length := len(status.joint_prefix)) > LONGEST_JOINT_PREFIX:
+            raise ValueError(f'episode_status with joint_prefix of {length} characters')
+        return status
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

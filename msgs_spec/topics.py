@@ -127,19 +127,12 @@ def _body_topics(task: TaskSpec) -> list[TopicSpec]:
             TopicSpec('object_pose', pose, 'Centre of the object.', _POSE, frame=WORLD),
             TopicSpec('object_twist', twist, 'The same, in world axes.', _TWIST, frame=WORLD),
         ]
-    if task.has_object and _reads_object_joint(task):
+    if task.has_object and 'object_joint' in task.observed_topics:
         joint = f'{task.object_name}:joint'
         text = 'Free joint of the object as MuJoCo holds it: angular velocity in the object frame.'
         dof = 'sensor_msgs/msg/MultiDOFJointState'
         specs.append(TopicSpec('object_joint', dof, text, _FREE_JOINT, frame=WORLD, names=(joint,)))
     return specs
-
-
-def _reads_object_joint(task: TaskSpec) -> bool:
-    """Return whether the observation depends on `object_joint`."""
-    if task.formulas is not None:
-        return 'object_joint' in task.formulas.topics
-    return task.goal is GoalKind.POSE
 
 
 def _goal_topics(task: TaskSpec) -> list[TopicSpec]:

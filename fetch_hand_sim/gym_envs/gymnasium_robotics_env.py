@@ -88,24 +88,6 @@ CAMERAS: dict[str, dict[str, Any]] = {
 }
 
 
-# Hooks of the reference that nothing here would ask.
-_NOT_ASKED = (
-    '_env_setup',
-    '_initialize_simulation',
-    '_mujoco_step',
-    '_reset_sim',
-    '_set_action',
-    '_step_callback',
-)
-
-
-def _refusal(hook: str) -> str:
-    return (
-        f'{hook} would have no effect here; what may be overridden: _sample_goal, _get_obs, '
-        '_is_success, compute_terminated, compute_truncated, compute_reward, _render_callback'
-    )
-
-
 def _pictures(task: str, camera: Mapping[str, Any] | None) -> dict[str, Any]:
     """Return the reference's size and view, with changes to its camera."""
     view = {**CAMERAS[task_spec(task).robot.name], **(camera or {})}
@@ -130,6 +112,15 @@ class RobotEnv(FetchHandEnv, GoalEnv):
     """
 
     metadata = {'render_modes': RENDER_MODES, 'render_fps': 25}  # noqa: RUF012
+    # Hooks of the reference.
+    _uncalled = (
+        *('_env_setup', '_initialize_simulation', '_mujoco_step'),
+        *('_reset_sim', '_set_action', '_step_callback'),
+    )
+    _hint = (
+        'what may be overridden: _sample_goal, _get_obs, _is_success, compute_terminated, '
+        'compute_truncated, compute_reward, _render_callback'
+    )
 
     def __init__(
         self,
@@ -138,9 +129,6 @@ class RobotEnv(FetchHandEnv, GoalEnv):
         **arguments: Any,
     ) -> None:
         """Compiles the model; arguments as `FetchHandEnv` has them."""
-        for name in _NOT_ASKED:
-            if hasattr(self, name):
-                raise TypeError(_refusal(name))
         self._mujoco_renderer: Any = None
         pictures = _pictures(task, default_camera_config)
         self._camera = pictures['default_camera_config']
@@ -158,9 +146,7 @@ class RobotEnv(FetchHandEnv, GoalEnv):
         )
 
     def __setattr__(self, name: str, value: Any) -> None:
-        """Refuses to change what would have no effect."""
-        if name in _NOT_ASKED:
-            raise TypeError(_refusal(name))
+        """Reject other values of facts."""
         if name in self.__dict__.get('_stated', ()):
             raise AttributeError(
                 f'{name} of {self.spec_of_task.name} is fixed; for other values write a task of '

@@ -56,6 +56,9 @@ class TaskAttributes:
     # Size of the batch, as arguments of `Simulation`.
     _batch: Mapping[str, Any] = {}
     _spec: EnvSpec | None = None
+    # Methods of other environments that nothing calls here, and a hint.
+    _uncalled: tuple[str, ...] = ()
+    _hint = ''
 
     def __init__(
         self,
@@ -72,6 +75,9 @@ class TaskAttributes:
         disturbances: Disturbances | Mapping[str, Any] | str | None = None,
         **batch: Any,
     ) -> None:
+        for name in self._uncalled:
+            if hasattr(self, name):
+                raise TypeError(f'{name} would have no effect here; {self._hint}')
         if render_mode is not None:
             one_of(render_mode, self.metadata['render_modes'], 'render_mode')
         self.simulation = Simulation(
@@ -95,6 +101,12 @@ class TaskAttributes:
             self.distance_threshold = distance_threshold
         if rotation_threshold is not None:
             self.rotation_threshold = rotation_threshold
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Reject a method that nothing calls."""
+        if name in self._uncalled:
+            raise TypeError(f'{name} would have no effect here; {self._hint}')
+        super().__setattr__(name, value)
 
     def __copy__(self) -> Self:
         """As `copy.deepcopy`: two environments have no physics or generators in common."""

@@ -60,6 +60,12 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
         'render_fps': int(DEFAULT_CONTROL_HZ),
     }
 
+    _uncalled = ('_get_obs', '_is_success', '_sample_goal')
+    _hint = (
+        'a batch calls compute_reward, compute_terminated and compute_truncated; single '
+        "environments (vectorization_mode='sync') call the others too"
+    )
+
     def __init__(
         self,
         task: str,
@@ -72,9 +78,6 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
     ) -> None:
         if max_episode_steps not in (None, _NO_LIMIT):
             require_whole('max_episode_steps (-1 for no limit)', max_episode_steps, lowest=1)
-        for name in _OF_SINGLE:
-            if hasattr(self, name):
-                raise TypeError(_refusal(name))
         modes = [mode.value for mode in AutoresetMode]
         asked = getattr(autoreset_mode, 'value', autoreset_mode)
         self.autoreset_mode = AutoresetMode(one_of(asked, modes, 'autoreset_mode'))
@@ -91,12 +94,6 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
         self._elapsed = np.zeros(num_envs, dtype=np.int64)
         self._ended = np.zeros(num_envs, dtype=bool)
         self._seeds: list[int | None] = [None] * num_envs
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        """Reject a method that only single environments call."""
-        if name in _OF_SINGLE:
-            raise TypeError(_refusal(name))
-        super().__setattr__(name, value)
 
     def reset(
         self,
@@ -365,17 +362,8 @@ _OF_EACH: dict[str, Callable[[FetchHandVectorEnv], Sequence[Any]]] = {
 }
 # Methods that all environments of a batch run together.
 _FOR_ALL = ('reset', 'step', 'close')
-# Methods that only single environments call.
-_OF_SINGLE = ('_get_obs', '_is_success', '_sample_goal')
 # Names of the single environment for what the batch calls otherwise.
 _SHARED = {'action_space': 'single_action_space', 'observation_space': 'single_observation_space'}
-
-
-def _refusal(name: str) -> str:
-    return (
-        f'a batch does not ask {name}; it asks compute_reward, compute_terminated and '
-        "compute_truncated; single environments (vectorization_mode='sync') ask the others too"
-    )
 
 
 def _evaluated(result: StepResult) -> tuple[Array, Array, dict[str, Any]]:

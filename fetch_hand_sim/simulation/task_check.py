@@ -13,7 +13,6 @@ from fetch_hand_sim.simulation.rewards import GoalMetric
 from fetch_hand_sim.simulation.simulation import Simulation
 from fetch_hand_sim.simulation.tasks import Task
 from msgs_spec.arrays import Array
-from msgs_spec.observations import observed_topics
 from msgs_spec.tasks import REWARD_TYPES, SUCCESS_RULES, GoalKind, TaskSpec, task_spec
 from msgs_spec.topics import sensor_topics
 
@@ -75,7 +74,7 @@ def _specification(spec: TaskSpec) -> Rules:
         is_range = np.isfinite([part.lower, part.upper]).all() and part.lower < part.upper
         yield is_range, f'command {part.name} has limits {part.lower} ... {part.upper}'
     published = [topic.name for topic in sensor_topics(spec)]
-    for topic in observed_topics(spec):
+    for topic in spec.observed_topics:
         yield topic in published, f'formulas read topic {topic!r}; allowed: {", ".join(published)}'
 
 
@@ -112,7 +111,7 @@ def _sensors(task: Task) -> Rules:
 def _formulas(task: Task) -> Rules:
     """Formulas must work on any leading axes, row by row."""
     spec = task.spec
-    rows = task.readings(observed_topics(spec))
+    rows = task.readings(spec.observed_topics)
     for topic in sensor_topics(spec):
         if topic.name in rows:
             offsets = [_OFFSET * ('quaternion' not in part.unit) for part in topic.layout]

@@ -53,7 +53,6 @@ CASES = {
             )
         ],
     ),
-    'euler_to_matrix': (rotations.euler_to_matrix, reference.euler2mat, [random_eulers()]),
     'euler_to_quaternion': (rotations.euler_to_quaternion, reference.euler2quat, [random_eulers()]),
 }
 

@@ -22,11 +22,10 @@ from fetch_hand_sim.simulation.tasks.task import BatchConfig, Generators, Ids, i
 from msgs_spec.arrays import Array
 from msgs_spec.robots import resting_command
 from msgs_spec.rotations import (
-    euler_to_matrix,
     euler_to_quaternion,
-    matrix_to_euler,
     quaternion_from_axis_angle,
     quaternion_multiply,
+    quaternion_to_euler,
     quaternion_to_matrix,
 )
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ, TaskSpec, substeps_per_tick
@@ -189,11 +188,9 @@ class HandManipulateTask(HandTask):
 def _parallel_rotations() -> Array:
     """Return the 24 rotations of a cube to itself, Euler xyz (24, 3), in the reference's order."""
     quarter = np.pi / 2
-    found: list[Array] = []
-    for euler in itertools.product([0.0, quarter, -quarter, np.pi], repeat=3):
-        turns = np.round(matrix_to_euler(euler_to_matrix(euler)) / quarter)
-        turns[[0, 2]] = np.where(turns[[0, 2]] == -2, 2, turns[[0, 2]])
-        rotation = turns * quarter
-        if not any((rotation == other).all() for other in found):
-            found.append(rotation)
-    return np.array(found)
+    products = list(itertools.product([0.0, quarter, -quarter, np.pi], repeat=3))
+    turns = np.round(quaternion_to_euler(euler_to_quaternion(products)) / quarter)
+    # Half a turn back is half a turn forward.
+    turns[:, [0, 2]] = np.where(turns[:, [0, 2]] == -2, 2, turns[:, [0, 2]])
+    _, first = np.unique(turns, axis=0, return_index=True)
+    return np.asarray(turns[np.sort(first)] * quarter)

@@ -16,6 +16,12 @@ from msgs_spec.tasks import (
     third_party_simulation,
 )
 
+_FAMILIES: dict[str, type[Task]] = {
+    **dict.fromkeys(FETCH_CONFIGS, FetchTask),
+    'HandReach': HandReachTask,
+    **dict.fromkeys(MANIPULATE_CONFIGS, HandManipulateTask),
+}
+
 
 def make_task(name: str, batch: BatchConfig | None = None) -> Task:
     """Compile the model of a task and start its simulations.
@@ -43,13 +49,7 @@ def make_task(name: str, batch: BatchConfig | None = None) -> Task:
 
 def _family(spec: TaskSpec) -> Any:
     """Return the class that simulates a task."""
-    if spec.name in FETCH_CONFIGS:
-        return FetchTask
-    if spec.name == 'HandReach':
-        return HandReachTask
-    if spec.name in MANIPULATE_CONFIGS:
-        return HandManipulateTask
-    return third_party_simulation(spec.name)
+    return _FAMILIES.get(spec.name) or third_party_simulation(spec.name)
 
 
 def task_asset(name: str) -> str:

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from fetch_hand_sim.simulation.models import ListedPairs, find, free_joint
 from fetch_hand_sim.simulation.rewards import GoalMetric
 from msgs_spec.arrays import Array
-from msgs_spec.observations import Readings, achieved_goal, observation, observed_topics
+from msgs_spec.observations import Readings, achieved_goal, observation
 from msgs_spec.robots import command_from_action
 from msgs_spec.tasks import (
     DEFAULT_CONTROL_HZ,
@@ -100,15 +100,7 @@ Generators = Sequence[np.random.Generator]
 
 @dataclass(frozen=True, slots=True)
 class BatchConfig:
-    """Size of a batch of simulations, and how it is stepped.
-
-    Attributes:
-        num_envs: Number of simulations N.
-        num_threads: Threads that step them; 0 for all processors that the process may use.
-        control_hz: Actions per simulated second: 500/n for n = 1 ... 40.
-        keeps_data: Whether each simulation keeps its own `MjData` with all derived values.
-        timing: Quantities that other rates than 25 Hz keep, see `msgs_spec.tasks.Timing`.
-    """
+    """Size of a batch of simulations, and how it is stepped; see `Simulation`."""
 
     num_envs: int = 1
     num_threads: int = 0
@@ -176,7 +168,6 @@ class Task(ABC):
         # stored unbound: a task that holds itself would only be freed by the garbage collector,
         # which underestimates the memory of a batch.
         self._sensors: dict[str, Callable[[Any], Array]] = {'joint_states': Task._joint_states}
-        self._observed = observed_topics(spec)
 
     @property
     def asset(self) -> str:
@@ -329,7 +320,7 @@ class Task(ABC):
 
     def observe(self) -> tuple[Array, Array]:
         """Return the observations (N, observation size) and achieved goals (N, goal size)."""
-        return self.observe_from(self.readings(self._observed))
+        return self.observe_from(self.readings(self.spec.observed_topics))
 
     def observe_from(self, readings: Readings) -> tuple[Array, Array]:
         """Return observations and achieved goals that follow from readings."""
