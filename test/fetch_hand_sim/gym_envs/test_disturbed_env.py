@@ -94,23 +94,3 @@ def test_an_episode_has_the_variation_that_was_asked_for():
     plain = plain.step(action)[0]
     assert not np.array_equal(plain['observation'], varied['observation'])
     assert np.array_equal(env.step(action)[0]['observation'], plain['observation'])
-
-
-@pytest.mark.parametrize(
-    ('disturbances', 'variation', 'line'),
-    [
-        (LATE, {'frction': 1.0}, 'frction.*allowed: action_latency'),
-        (LATE, {'friction': 100.0}, 'friction=100.0; allowed: a number 0.05 ... 20'),
-        (LATE, {'friction': 'high'}, 'high.*allowed: one finite number'),
-        (LATE, {'damping': 2.0}, 'FetchPush has no damping'),
-        (LATE, 3, "variation: '3' given; allowed: a mapping"),
-        (None, {'friction': 1.0}, 'undisturbed'),
-    ],
-)
-def test_impossible_variations_are_rejected_and_nothing_moves(disturbances, variation, line):
-    env = fetch_hand_sim.make_vec('FetchPush', 2, disturbances=disturbances)
-    env.reset(seed=0)
-    before = env.unwrapped.simulation.data(0).qpos.copy()
-    with pytest.raises(ValueError, match=line):
-        env.reset(seed=1, options={'variation': variation})
-    assert np.array_equal(env.unwrapped.simulation.data(0).qpos, before)

@@ -1,4 +1,4 @@
-"""The reset option `start`: joints, object pose and velocities in place of drawn ones."""
+"""The reset option `start`, and values of `start` and `variation` that are rejected."""
 
 from __future__ import annotations
 
@@ -126,10 +126,29 @@ NAMES = 'allowed: joints, joint_velocities, object_pose, object_velocity'
     ],
 )
 def test_an_impossible_start_is_refused_in_one_line_and_nothing_moves(task, start, line):
-    env = fetch_hand_sim.make_vec(task, 2)
+    assert_rejected(fetch_hand_sim.make_vec(task, 2), {'start': start}, line)
+
+
+@pytest.mark.parametrize(
+    ('disturbances', 'variation', 'line'),
+    [
+        ('mild', {'frction': 1.0}, 'frction.*allowed: action_latency'),
+        ('mild', {'friction': 100.0}, 'friction=100.0; allowed: a number 0.05 ... 20'),
+        ('mild', {'friction': 'high'}, 'high.*allowed: one finite number'),
+        ('mild', {'damping': 2.0}, 'FetchPush has no damping'),
+        ('mild', 3, "variation: '3' given; allowed: a mapping"),
+        (None, {'friction': 1.0}, 'undisturbed'),
+    ],
+)
+def test_an_impossible_variation_is_rejected_likewise(disturbances, variation, line):
+    env = fetch_hand_sim.make_vec('FetchPush', 2, disturbances=disturbances)
+    assert_rejected(env, {'variation': variation}, line)
+
+
+def assert_rejected(env, options, line) -> None:
     before, _ = env.reset(seed=0)
     with pytest.raises(ValueError, match=line) as caught:
-        env.reset(seed=1, options={'start': start})
+        env.reset(seed=1, options=options)
     assert '\n' not in str(caught.value)
     after = env.unwrapped.simulation.observe()
     assert all((after[name] == before[name]).all() for name in before)
