@@ -61,7 +61,7 @@ class InputWatch:
         )
 
     def problems(self) -> list[str]:
-        """Return one line for each problem."""
+        """Return one line for each problem, such as two commanders or another message type."""
         problems, names = [], self.commanders
         if len(names) > 1:
             problems.append(f'{len(names)} publish commands: {", ".join(names)}')
@@ -72,7 +72,7 @@ class InputWatch:
         return problems
 
     def _copies(self, node: str, topic: str) -> int:
-        """Return how many processes of this name publish a topic.
+        """Return how many processes with the node name `node` publish `topic`.
 
         A killed process stays in the graph for a while; it and its successor count as one.
         """

@@ -82,18 +82,18 @@ class Health:
         return self._recorder is not None and self._recorder.has_failed
 
     def messages(self, now: float) -> Messages:
-        """Close a period: return its messages, and log what is new."""
+        """Return the messages about the time since the last call, and log new problems."""
         report = self.report(now)
         self._log_news()
         factor = self._factor_codec.encode(0, [self._real_time_factor])
         return [(DIAGNOSTICS, encode_reports(report)), (REAL_TIME_FACTOR, factor)]
 
     def log_waiting(self) -> None:
-        """Log the missing command, at most once in `WAITING_PERIOD`."""
+        """Log that the robot waits for a command, at most once in `WAITING_PERIOD`."""
         self._node.get_logger().warning(self._waiting(), **seldom(WAITING_PERIOD))
 
     def report(self, now: float) -> Report:
-        """Close a period and return its report."""
+        """Return the report on the time since the last report."""
         robot, seconds = self._robot, max(now - self._then, 1e-9)
         self._then = now
         self._real_time_factor = self._simulated.since(robot.runner.stamp_ns) * 1e-9 / seconds
@@ -120,7 +120,7 @@ class Health:
         return report
 
     def _passing_problems(self, grown: Mapping[str, int], seconds: float) -> Iterator[Problem]:
-        """Yield the problems of a period, from the increase of each counter."""
+        """Yield problems that happened since the last report, from the increase of each counter."""
         robot = self._robot
         schedule, buffer = robot.schedule, robot.buffer
         asked = schedule.asked_rate if robot.runner.has_started else None
@@ -179,7 +179,7 @@ class Health:
         return f'{tick} waits for a valid command; {self._command_source()}{last}'
 
     def _command_source(self) -> str:
-        """Return which nodes should send commands, as the end of a sentence."""
+        """Return the end of a sentence: which nodes should send commands."""
         if names := self._watch.inputs.commanders:
             return f'{", ".join(names)} {"sends" if len(names) == 1 else "send"} none'
         return '; '.join(['no node publishes any', *self._watch.waiting_elsewhere()])

@@ -130,7 +130,7 @@ class SimNode(Node):
         return publishers
 
     def _open_ground_truth(self) -> None:
-        """Publish the true state too, once something disturbs the robot."""
+        """Publish the undisturbed state on topics of its own from the first disturbance on."""
         if read_disturbances(self._settings['disturbances']).is_off:
             return
         for spec in ground_truth_topics(self._robot.runner.spec):
@@ -239,7 +239,10 @@ class SimNode(Node):
             self._ticked_at = time.monotonic()
 
     def _beat_when_due(self) -> None:
-        """Do what is needed a few times a second; a tick that is near goes first."""
+        """Publish the latest tick, read the graph and report health, a few times a second.
+
+        A tick that is due soon goes first.
+        """
         now = time.monotonic()
         if now < self._beat_due or (
             self._robot.wait() < _BEAT_TIME and now < self._beat_due + BEAT
@@ -256,7 +259,7 @@ class SimNode(Node):
             self._publish(self._health.messages(now))
 
     def _stand_still(self, now: float) -> None:
-        """Publish `/clock` while idle and repeat the last tick for new subscribers."""
+        """While no tick runs: publish `/clock`, repeat the last tick for new subscribers, warn."""
         robot, watch = self._robot, self._watch
         has_started = robot.runner.has_started
         if robot.schedule.is_paused or not has_started:

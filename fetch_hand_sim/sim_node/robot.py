@@ -125,7 +125,7 @@ class Robot:
 
     @property
     def lacks_answer(self) -> bool:
-        """True if a step now would apply a late command.
+        """True if the command that answers the last tick may still arrive.
 
         A command that names no observation answers the last tick before it. Only a robot in real
         time that receives commands expects an answer.
@@ -141,7 +141,7 @@ class Robot:
         return not self.misses_commands
 
     def tick_when_due(self) -> None:
-        """Run the tick that is due by `wait`."""
+        """Run the tick that is due and set the next deadline; call it once `wait` returns 0."""
         now, age = self._clock(), self.buffer.age()
         if self.lacks_answer:
             self.schedule.postpone(now)
@@ -151,7 +151,7 @@ class Robot:
         self.tick()
 
     def tick(self) -> None:
-        """Apply the latest command, advance by one tick and emit it."""
+        """Apply the latest command, simulate one tick, publish and log its messages."""
         began, is_late = self._clock(), self.lacks_answer
         tick = self.runner.advance(self.buffer.take())
         phase = tick.status.phase
@@ -222,7 +222,7 @@ class Robot:
         return Answer(True, f'{ends}; a tick of its own {starts}')
 
     def _silence_begins(self) -> float:
-        """Return the time from which no command for the last tick is on its way.
+        """Return the time after which a command for the last tick no longer arrives.
 
         Such a command would otherwise answer the state after the reset, and the policy would lag
         one tick behind from then on.
@@ -251,7 +251,7 @@ class Robot:
         return Answer(True, f'{ticks} run, now at {self._now()}')
 
     def set_real_time_factor(self, factor: float) -> None:
-        """Change the pace from now on."""
+        """Set the simulated seconds per wall-clock second, from now on."""
         self.schedule.set_real_time_factor(factor, self._clock())
 
     def _now(self) -> str:

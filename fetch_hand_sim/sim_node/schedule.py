@@ -77,7 +77,10 @@ class TickSchedule:
         return max(0.0, due + (self.answer_wait if lacks_answer else 0.0) - now)
 
     def postpone(self, until: float) -> None:
-        """Move the deadline, because the tick waited for an answer; at most by `answer_wait`."""
+        """Move the deadline to `until`, because the tick waited for its command.
+
+        It moves by `answer_wait` at most.
+        """
         self._due = min(max(self._due, until), self._due + self.answer_wait)
 
     def begin(self, now: float) -> None:
@@ -101,7 +104,7 @@ class TickSchedule:
         self.restart(now)
 
     def set_real_time_factor(self, factor: float, now: float) -> None:
-        """Change the pace from now on."""
+        """Set the simulated seconds per second; deadlines follow the new pace from `now` on."""
         self._factor = factor
         self.changes += 1
         self.restart(now)

@@ -80,7 +80,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
 
 
 def _given(options: argparse.Namespace, *names: str) -> str:
-    """Return the given ones of these options, as the user writes them."""
+    """Return which of the options `names` the user has given, as written on the command line."""
     return ' and '.join(f'--{name.replace("_", "-")}' for name in names if getattr(options, name))
 
 

@@ -67,7 +67,10 @@ class Curves:
         )
 
     def _positions(self, frame: Frame) -> Array:
-        """Return the joints that the commands drive; NaN for the axes of the gripper's path."""
+        """Return the position of the joint that each command drives.
+
+        It is NaN for commands that move the gripper along an axis.
+        """
         joints = frame.joint_position
         positions = np.array([np.nan if i is None else joints[i] for i in self._commanded])
         for index in self._grippers:

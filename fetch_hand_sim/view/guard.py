@@ -53,7 +53,7 @@ _ROLE, _READ_ONLY_ROLE = b'\0Controlling\0', b'\0Watching\0\0\0\0'
 
 
 class Attendance:
-    """Records whether a visitor is at the page in control; any thread may call it.
+    """Records whether somebody uses the page that controls the robot; safe for any thread.
 
     Args:
         clock: A steady clock, seconds.
@@ -66,20 +66,20 @@ class Attendance:
 
     @property
     def is_there(self) -> bool:
-        """True if the visitor in control has sent input within the last seconds."""
+        """True if the page in control has sent input within the last seconds."""
         return self._clock() - self._heard < _SILENCE
 
     def note(self) -> None:
-        """Record input of the visitor in control."""
+        """Record that the page in control has sent input."""
         self._heard = self._clock()
 
     def end_visit(self) -> None:
-        """Record that the visitor in control has disconnected."""
+        """Record that the page in control has disconnected."""
         self._heard = -math.inf
         self._visits += 1
 
     def has_left(self) -> bool:
-        """Return whether the visitor is absent, or has left since the last call."""
+        """Return whether nobody is at the page, or somebody has left it since the last call."""
         visits, before = self._visits, self._known_visits
         self._known_visits = visits
         return visits != before or not self.is_there
@@ -110,7 +110,7 @@ class Guard:
         self._cookie = _COOKIE.format(port=port)
 
     def refusal(self, target: str, headers: Headers) -> Response | None:
-        """Return the answer to a rejected request for `target` (path and query), or None."""
+        """Return the error response to a request for `target` (path and query); None allows it."""
         try:
             path = urlsplit(target).path
         except ValueError:
@@ -130,7 +130,7 @@ class Guard:
         return None
 
     def admission(self, target: str) -> str | None:
-        """Return the cookie for a visitor with the token in the address, or None."""
+        """Return the cookie to set if `target` contains the token, else None."""
         if self.token is None or not self._matches(_tokens_in(target)):
             return None
         # Strict cookies are not sent after a link on another site. Only web sockets can command,
@@ -229,7 +229,10 @@ def _adapt(response: Response, is_read_only: bool) -> None:
 
 
 def _attended(handler: Any, attendance: Attendance) -> Callable[[Any], Awaitable[None]]:
-    """Return a handler of web sockets that records attendance and closes in time."""
+    """Wrap a handler of web sockets so that it records input and departure.
+
+    It waits only briefly for a browser that does not confirm the end of the connection.
+    """
 
     async def handle(connection: Any) -> None:
         # A browser that hangs does not confirm the end, and the next visitor would wait for it.

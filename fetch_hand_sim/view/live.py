@@ -131,7 +131,7 @@ class LiveRobot:
             self._is_new = True
 
     def leave(self) -> None:
-        """Stop the commands of the page, because its visitor has left."""
+        """Stop the commands of the page, because its user has left."""
         self._stop_commanding('the visitor left: the sliders no longer command')
 
     def _stop_commanding(self, notice: str) -> None:
@@ -140,7 +140,7 @@ class LiveRobot:
             self._update_facts(notice=notice)
 
     def _notice_other_robot(self) -> None:
-        """End commands and goals that were meant for a robot that has shut down or restarted."""
+        """If the robot has shut down or restarted, end commands and goals meant for it."""
         publishers = status_publishers(self._node)
         if publishers != self._publishers:
             self._publishers = publishers
@@ -207,7 +207,7 @@ class LiveRobot:
             self._update_facts(is_silent=False)
 
     def _look(self) -> None:
-        """Look at the graph, and read settings that may have changed."""
+        """Check the ROS graph for another robot or a replay, and read changed settings."""
         self._notice_other_robot()
         is_other = self._replays.look()
         replay = self._replays.replay
@@ -230,14 +230,14 @@ class LiveRobot:
             self._requests.read_actor()
 
     def _end_notice(self) -> None:
-        """Remove a notice of an earlier episode."""
+        """Remove the notice on the page once its episode is over and it was shown for a while."""
         episode, since = self._noticed
         is_over = episode != (self._facts.episode, self._facts.seed)
         if self._facts.notice and is_over and time.monotonic() - since > _NOTICE_TIME:
             self._update_facts(notice='')
 
     def _follow_replay(self, name: str) -> None:
-        """Fill in the facts that a robot publishes in its diagnostics."""
+        """Set the facts of a replay node `name`, which publishes no diagnostics as a robot does."""
         self._hear()
         self._asked_rate = None
         self._unread.add('speed')
@@ -274,7 +274,7 @@ class LiveRobot:
         self._yield_to_others()
 
     def _yield_to_others(self) -> None:
-        """Stop commanding while another node commands."""
+        """Stop the commands of the page if another node commands."""
         own = self._node.get_fully_qualified_name()
         others = [each for each in self._facts.commander.split(', ') if each != own]
         if others not in ([], ['-']):

@@ -79,9 +79,9 @@ def _run(options: argparse.Namespace, stop: StopSignals) -> None:
 
 
 def attended(robot: LiveRobot, attendance: Attendance) -> Perform:
-    """Return a function that passes requests to a robot while a visitor is at the page.
+    """Return a function that passes requests to a robot only while somebody uses the page.
 
-    An absent visitor's page is still drawn, and repeats the requests of held buttons.
+    A page that nobody uses is still drawn, and would repeat the request of a held button.
     """
 
     def perform(request: Request) -> None:
@@ -122,7 +122,10 @@ def _nodes(
 
 
 def _check_is_wanted(options: argparse.Namespace, spec: TaskSpec, where: str) -> None:
-    """Raise an error if the running robot is not the requested one."""
+    """Raise NodeFailure if the running robot has another task than `options.task`.
+
+    Raise UsageError if options are given that only a new robot could use.
+    """
     if options.task not in (None, spec.name):
         raise NodeFailure(f'a robot in {where} runs already and does {spec.name}')
     if options.for_a_start:

@@ -1,4 +1,4 @@
-"""Messages from the source to the page: everything that the page shows of one tick.
+"""Messages to the page from its source (a running robot or a file player): one tick each.
 
 A newer snapshot replaces an older one; every event arrives (`mujoco.studio.messages`).
 """
@@ -74,7 +74,7 @@ class Series:
     values: Array
 
     def until(self, time: float) -> Series:
-        """Return the part up to a time."""
+        """Return the part of the curve up to `time`, simulated seconds."""
         known = self.times <= time + 1e-9
         return Series(self.times[known], self.values[known])
 
@@ -98,7 +98,7 @@ class Graphs:
     positions: Series | None = None
 
     def until(self, time: float) -> Graphs:
-        """Return the parts up to a time."""
+        """Return the part of each curve up to `time`, simulated seconds."""
         series = (getattr(self, each.name) for each in fields(self))
         return Graphs(*(each.until(time) if each is not None else None for each in series))
 
@@ -145,6 +145,6 @@ class Picture(messages.Snapshot):
 
 @dataclass(frozen=True, eq=False)
 class ShowScene(messages.Event):
-    """Makes the page show another robot."""
+    """Message: the page loads the model of another task."""
 
     scene: Scene

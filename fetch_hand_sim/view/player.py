@@ -139,14 +139,14 @@ class Player:
         self._position = float(self._recording.times[min(max(index, 0), last)])
 
     def _change(self, numbers: Sequence[int]) -> None:
-        """Open the first readable episode of these. Without one, stay and set a notice."""
+        """Open the first readable episode of these; without one, stay and show a notice."""
         try:
             self._open_first(numbers)
         except EpisodeReadError as error:
             self._notice = str(error)
 
     def _open_first(self, numbers: Sequence[int]) -> None:
-        """Open the first readable episode of these."""
+        """Open the first readable episode of these; EpisodeReadError if there is none."""
         skipped: list[EpisodeReadError] = []
         for number in numbers:
             try:

@@ -1,4 +1,4 @@
-"""Messages from the page to the source: requests of the visitor.
+"""Messages from the page to its source (a running robot or a file player): user requests.
 
 A newer snapshot replaces an older one; every event arrives (`mujoco.studio.messages`).
 """
@@ -13,7 +13,7 @@ from msgs_spec.arrays import Array
 
 
 class Request(messages.Message):
-    """A request of the visitor: an event, or a snapshot that is sent repeatedly."""
+    """A request of the user: an event sent once, or a snapshot sent in every frame."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class SetSpeed(Request, messages.Event):
 
 @dataclass(frozen=True)
 class ChooseActor(Request, messages.Event):
-    """Lets another actor command."""
+    """Makes the policy node load another actor."""
 
     name: str
 

@@ -122,7 +122,10 @@ class RemoteNode:
         self._asked.clear()
 
     def _awaits(self, name: str) -> bool:
-        """Return whether an answer may still arrive: requests pile up in a node that hangs."""
+        """Return whether request `name` still waits for its answer, so that none is sent again.
+
+        A request without an answer is given up after a few seconds.
+        """
         future, asked = self._asked.get(name, (None, 0.0))
         is_recent = time.monotonic() - asked < _ANSWER_TIMEOUT
         return future is not None and not future.done() and is_recent
@@ -173,7 +176,7 @@ class RobotRequests:
         return self._policy.is_there()
 
     def take_task(self, spec: TaskSpec) -> None:
-        """Take the task of the robot; requests to a robot of another task end."""
+        """Set the task of the robot; drop goal and command if they were for another task."""
         if self._spec is not None and self._spec.name != spec.name:
             self.forget_goal()
             # Goals of another task may have another type.
@@ -195,7 +198,7 @@ class RobotRequests:
             self._replay = replay, RemoteNode(self._node, replay.name, self._notice)
 
     def begin_episode(self) -> None:
-        """Send the kept goal to a new episode."""
+        """Send the goal that the user keeps to the new episode."""
         if self._kept_goal is not None and self._replay is None:
             self._send_goal(self._kept_goal)
 
@@ -264,7 +267,11 @@ class RobotRequests:
         return request.values.size == topic(self._spec, name).size
 
     def shown_goal(self, goal: Array) -> Array:
-        """Return the goal (goal size,) that the page has just set, else the robot's goal."""
+        """Return the goal to draw, (goal size,): `goal`, which the robot publishes.
+
+        A goal that the page has sent is drawn instead until the robot publishes it, for a few
+        seconds at most.
+        """
         if self._asked_goal is not None:
             at, asked = self._asked_goal
             if time.monotonic() - at < _GOAL_TIMEOUT and not np.allclose(goal, asked):
@@ -274,7 +281,7 @@ class RobotRequests:
 
     @property
     def _time(self) -> RemoteNode:
-        """The node that controls time."""
+        """The node that controls pause, step and speed: the replay node if there is one."""
         return self._sim if self._replay is None else self._replay[1]
 
     @property
@@ -314,7 +321,7 @@ class RobotRequests:
         self._publishers[name].publish(data)
 
     def _withdraw(self, name: str) -> None:
-        """Destroy a publisher: a publisher of commands counts as a commander."""
+        """Destroy the publisher `name`: each publisher of commands counts as a commander."""
         publisher = self._publishers.pop(name, None)
         if publisher is not None:
             self._node.destroy_publisher(publisher)

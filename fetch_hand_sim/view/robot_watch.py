@@ -213,7 +213,7 @@ class RobotWatch:
         return collect
 
     def _finish_tick(self, status: EpisodeStatus | None = None) -> None:
-        """Pass the tick on if it is complete."""
+        """Call `on_tick` if all messages of the tick have arrived."""
         values, spec = self._values, self.spec
         if spec is None or any(name not in values for name in _NEEDED):
             return
@@ -272,7 +272,7 @@ class ReplayWatch:
         self._moved = True
 
     def look(self) -> bool:
-        """Look at the graph; return whether the replay is another one than before."""
+        """Read the ROS graph; return whether a replay node has come, gone or been replaced."""
         found, before = _find_replay(self._node), self.replay
         self.replay = found
         now = time.monotonic()
@@ -286,7 +286,7 @@ class ReplayWatch:
         return found != before
 
     def stands_still(self, is_paused: bool) -> bool:
-        """Return whether a replay is still paused: another client may have resumed it.
+        """Return whether a paused replay still publishes no ticks; another client may resume it.
 
         Args:
             is_paused: Whether it was paused at the last look.
@@ -297,7 +297,7 @@ class ReplayWatch:
 
 
 def status_publishers(node: Node) -> frozenset[bytes]:
-    """Return the identities of the publishers of `episode_status`: another robot has others."""
+    """Return the identities of the publishers of `episode_status`; they change with the robot."""
     return frozenset(bytes(info.endpoint_gid) for info in _publishers(node))
 
 
@@ -313,7 +313,7 @@ def _find_replay(node: Node) -> Replay | None:
 
 
 def _as_replay(node: Node, info: Any) -> Replay | None:
-    """Return the replay if the node of a publisher can be paused but not reset, else None."""
+    """Return the node of a publisher as a replay if it offers pause but not reset, else None."""
     name, namespace = info.node_name, info.node_namespace
     if not namespace.startswith('/'):
         # The publisher was discovered before its node.

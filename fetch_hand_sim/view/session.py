@@ -26,14 +26,17 @@ _DROPPED = (
 
 
 class Requests(plugin.SimPlugin):
-    """Calls `perform` with each request of the page, and with pulls at bodies."""
+    """Plugin of the viewer: calls `perform` with each request of the page.
+
+    Perturbations of bodies become `Push` requests.
+    """
 
     def __init__(self, perform: Perform) -> None:
         self._perform = perform
 
     @messages.handler
     def on_message(self, message: messages.Message) -> bool:
-        """Pass on a request; return True for messages that the viewer must not handle itself."""
+        """Handle a message; return True if the viewer must not handle it as well."""
         match message:
             case Request():
                 self._perform(message)
@@ -46,7 +49,7 @@ class Requests(plugin.SimPlugin):
 
 
 class Session:
-    """One page and its source.
+    """One open page and its source, a running robot or a file player.
 
     Args:
         handle: The viewer that shows the page.

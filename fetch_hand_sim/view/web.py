@@ -81,7 +81,10 @@ class Address:
 
 @dataclass(frozen=True, slots=True)
 class Touch:
-    """Input of one frame; the page counts as touched while a button is held or `mouse` changes."""
+    """Mouse and buttons in one frame; they tell whether the page is in use.
+
+    It is while a button is held or `mouse` changes.
+    """
 
     mouse: tuple[float, float] = (0.0, 0.0)
     wheel: float = 0.0
@@ -119,7 +122,7 @@ class FrameRate:
 
 
 class _Viewer(web_viewer.WebViewer):
-    """The web viewer without files from visitors."""
+    """MuJoCo's web viewer, which accepts no files from the page."""
 
     frame_rate: FrameRate
 
@@ -247,7 +250,7 @@ def _wake_seldom() -> None:
 
 
 def is_no_farewell(record: logging.LogRecord) -> bool:
-    """Return whether a log record is about more than a visitor who has left."""
+    """Return False for log records of a closed connection, which would only fill the log."""
     error = record.exc_info[1] if record.exc_info else None
     return not isinstance(error, ConnectionClosed)
 
@@ -274,7 +277,7 @@ def _listen(host: str, port: int) -> socket.socket:
 
 
 def _check_guarded(address: Address) -> None:
-    """Send a request with a foreign Host and require its rejection."""
+    """Send a request with a foreign Host header; raise CommandError unless it is rejected."""
     host = _LOOPBACK if address.host in _EVERYWHERE else address.host
     deadline = time.monotonic() + _START_TIMEOUT
     while True:

@@ -48,7 +48,7 @@ def pulls(model: mujoco.MjModel, snapshot: messages.PerturbSnapshot) -> list[tup
 
 
 class BodyDrag:
-    """A spring between the mouse and a body; changes the perturbation that a viewer draws."""
+    """A spring between the mouse and a body: it sets MuJoCo's perturbation, which is drawn."""
 
     def __init__(self, viewer: viewer_protocol.Viewer) -> None:
         self._viewer = viewer

@@ -34,7 +34,7 @@ class GoalPanel:
     """The part of the robot's panel that sets the goal.
 
     Attributes:
-        keeps_goal: True if later episodes repeat the visitor's goals.
+        keeps_goal: True if later episodes repeat the goal set here.
     """
 
     def __init__(self, send: Send) -> None:

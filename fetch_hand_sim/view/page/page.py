@@ -23,7 +23,7 @@ from msgs_spec.arrays import Array
 
 @dataclasses.dataclass(slots=True)
 class _GoalDrag:
-    """A goal that the mouse holds."""
+    """State of a drag: the grabbed goal and where it was when the mouse grabbed it."""
 
     handle: Handle
     goal: Array
@@ -31,7 +31,7 @@ class _GoalDrag:
 
 
 class Page(plugin.ViewerPlugin):
-    """Draws pictures, and sends the visitor's requests.
+    """Draws the scene and the panels, and sends the user's requests.
 
     Args:
         episodes: Episode files to choose from.
@@ -56,7 +56,7 @@ class Page(plugin.ViewerPlugin):
 
     @messages.handler
     def on_scene(self, event: ShowScene) -> None:
-        """Take another robot, whose model follows."""
+        """Prepare for another robot; its model arrives in the next `PostModelEvent`."""
         self._scene, self._picture, self._goal_drag = event.scene, None, None
 
     @messages.handler
@@ -70,12 +70,12 @@ class Page(plugin.ViewerPlugin):
 
     @messages.handler
     def on_picture(self, picture: Picture) -> None:
-        """Take the newest picture."""
+        """Store the newest picture, which the next frame draws."""
         self._picture = picture
 
     @messages.handler
     def on_theme(self, event: plugin.ThemeEvent) -> None:
-        """Use the theme that the visitor has chosen."""
+        """Use the theme that the user has chosen."""
         ux.setup_theme(event.theme)
 
     @messages.handler

@@ -35,10 +35,10 @@ _TWO_COLUMNS = 2.0 * WIDTH + 3.0 * MARGIN
 
 
 class Panels:
-    """All panels, with the input of the visitor.
+    """All panels, and what the user has entered in them.
 
     Args:
-        send: Called with the requests of the visitor.
+        send: Called with each request of the user.
         episodes: Episode files to choose from.
 
     Attributes:
@@ -99,12 +99,12 @@ class Panels:
 
 
 def _height(is_shown: bool) -> float:
-    """Return the height of the current window, or of the button that replaces it, pixels."""
+    """Return the height, pixels, of the current window, or of its button if it is hidden."""
     return float(imgui.GetWindowSize().y) if is_shown else _BUTTON_HEIGHT
 
 
 class EpisodeList:
-    """A list of episodes to click; only visible ones are read."""
+    """A list of episodes to choose from; only files of visible rows are read."""
 
     def __init__(self, paths: tuple[Path, ...], send: Send) -> None:
         self._paths = paths
@@ -145,7 +145,7 @@ def describe(path: Path) -> str:
 
 
 def draw_timeline(timeline: Timeline, facts: Facts, send: Send) -> None:
-    """Draw the buttons of a file, the speed and the slider over all frames."""
+    """Draw the playback controls of an episode file: buttons, speed, slider over all frames."""
     imgui.BeginDisabled(not facts.may_command)
     if imgui.Button('<< Episode'):
         send(ChangeEpisode(-1))

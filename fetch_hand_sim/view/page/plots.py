@@ -39,7 +39,7 @@ def draw_plots(spec: TaskSpec, graphs: Graphs, width: float) -> None:
 
 
 def command_curves(part: CommandPart, graphs: Graphs, index: int) -> dict[str, Series]:
-    """Return a command and the positions that it drives, by their names on the page."""
+    """Return the curves of one command and of the joint that it drives, by label."""
     assert graphs.commands is not None
     command = _column(graphs.commands, index)
     if is_move(part):

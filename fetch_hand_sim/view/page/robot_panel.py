@@ -37,7 +37,7 @@ _INTRODUCTIONS = {
 
 
 def introduction(spec: TaskSpec) -> str:
-    """Return the purpose of a task in a line."""
+    """Return one line that says what the robot should do in a task."""
     text = _INTRODUCTIONS.get(spec.name)
     things = (word for word in ('Block', 'Egg', 'Pen') if f'HandManipulate{word}' in spec.name)
     if spec.formulas is None and (thing := next(things, '').lower()):
@@ -48,7 +48,7 @@ def introduction(spec: TaskSpec) -> str:
 
 
 class RobotPanel:
-    """The panel of the robot, with the input of the visitor."""
+    """The panel of a running robot, and what the user has entered in it."""
 
     def __init__(self, send: Send, goal_panel: GoalPanel) -> None:
         self._send = send

@@ -22,14 +22,14 @@ _AS_FAST_AS_POSSIBLE = 0.0
 
 
 class Windows:
-    """Windows that the visitor can hide."""
+    """Windows of the page that the user can hide."""
 
     def __init__(self) -> None:
         self._hidden: set[str] = set()
         self._has_folded = False
 
     def fold_once(self, *names: str) -> None:
-        """Hide windows at the first call only."""
+        """Hide these windows at the first call; later calls leave them as the user has set them."""
         if not self._has_folded:
             self._has_folded = True
             self._hidden.update(names)
@@ -85,7 +85,7 @@ def draw_pause(is_paused: bool, resume: str, send: Send) -> None:
 
 
 def draw_step(label: str, frames: int, send: Send) -> None:
-    """Draw a button that shows another tick."""
+    """Draw a button that moves by `frames` ticks."""
     if imgui.Button(label):
         send(StepOnce(frames))
 
