@@ -1,6 +1,7 @@
-"""The training configuration: one table of fields, and the rules between them.
+"""The configuration of a training run: its fields in groups, and the rules between them.
 
-Each class is a group of fields. `TrainConfig` has them all; `flat.py` reads what users give.
+Each class before `TrainConfig` is a group of fields; `TrainConfig` inherits all groups. `flat.py`
+reads the values that users give.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from policy_node.policies.goal_features import goal_features
 
 @dataclass(frozen=True, slots=True)
 class Range:
-    """Least and largest value of a number."""
+    """Smallest and largest allowed value of a number, both included."""
 
     low: float
     high: float = math.inf
@@ -329,17 +330,22 @@ class TrainConfig(
     Collect,
     Start,
 ):
-    """Everything that decides what a run learns; the same on every worker.
+    """All settings of a training run, except its folder; equal on all workers.
 
     `num_envs`, `batch_size` and `replay_transitions` are totals: with N workers each takes its
-    share, so the `paper` recipe on 19 workers is the paper's set-up worker by worker.
+    share. So the `paper` recipe on 19 workers gives each worker the set-up of a worker in the
+    paper.
 
     Raises:
         ValueError: If a value is not allowed, or fields exclude each other.
     """
 
     def __post_init__(self) -> None:
-        """Checks each field, then the rules between fields."""
+        """Check each field, then the rules between fields.
+
+        Raises:
+            ValueError: If a value is not allowed, or fields exclude each other.
+        """
         for name, kind in TYPES.items():
             require_within(name, getattr(self, name), kind)
         for is_broken, reason in _rules(self, task_spec(self.task, control_hz=self.control_hz)):
@@ -348,27 +354,27 @@ class TrainConfig(
 
     @property
     def tick_share(self) -> float:
-        """Duration of a tick in units of what `gamma` discounts."""
+        """Duration of a tick in units of `gamma`: 1, or with `discount` time its share of 40 ms."""
         return DEFAULT_CONTROL_HZ / self.control_hz if self.discount == 'time' else 1.0
 
     @property
     def tick_gamma(self) -> float:
-        """Discount of a tick."""
+        """Discount factor from one tick to the next."""
         return float(self.gamma**self.tick_share)
 
     @property
     def lowest_value(self) -> float:
-        """Value of a state after which every tick is rewarded with -1."""
+        """Lowest possible value: the discounted return if each reward, before scaling, is -1."""
         return -self.tick_share / (1.0 - self.tick_gamma)
 
     @property
     def noise_ticks(self) -> int:
-        """Number of ticks for which noise on actions holds."""
+        """Number of ticks before exploration noise is drawn again, at least 1."""
         return max(round(self.noise_seconds * self.control_hz), 1)
 
     @property
     def narrows(self) -> bool:
-        """True if goals are easier to meet at the start of a run than at its end."""
+        """True if the success thresholds start wider than those of the task and shrink to them."""
         return self.first_distance != 1.0 or self.first_rotation != 1.0
 
 
@@ -387,27 +393,27 @@ DEFAULTS: dict[str, Any] = {
 
 
 def range_of(kind: Any) -> Range | None:
-    """Return the range of an annotated number, or None."""
+    """Return the `Range` in a field's type, or None if the type has none."""
     return kind.__metadata__[0] if typing.get_origin(kind) is Annotated else None
 
 
 def choices_of(kind: Any) -> tuple[str, ...]:
-    """Return the values of a literal type; of any other none."""
+    """Return the allowed values of a `Literal` type; an empty tuple for any other type."""
     return typing.get_args(kind) if typing.get_origin(kind) is Literal else ()
 
 
 def plain_type(kind: Any) -> Any:
-    """Return a type without its range; a literal is a `str`."""
+    """Return a field's type without its `Range`; `str` for a `Literal`."""
     if typing.get_origin(kind) is Annotated:
         return typing.get_args(kind)[0]
     return str if choices_of(kind) else kind
 
 
 def require_within(name: str, value: Any, kind: Any) -> None:
-    """Reject a value that the type of its field does not allow.
+    """Raise ValueError if `value` is outside the choices or the range in the field's type `kind`.
 
     Raises:
-        ValueError: One line names the field, the value and the allowed ones.
+        ValueError: In one line, the field, the value and the allowed values.
     """
     choices, limits = choices_of(kind), range_of(kind)
     if choices and value not in choices:
@@ -505,13 +511,16 @@ _ALTERNATIVES = ('n_step', 'longest_hold', 'advantage', 'condition', 'importance
 
 
 def changed_fields(config: TrainConfig, names: typing.Iterable[str]) -> list[str]:
-    """Return the fields among these, as `name value`, that differ from their default."""
+    """Return 'name value' for each field in `names` that differs from its default."""
     values = {name: getattr(config, name) for name in names}
     return [f'{name} {value}' for name, value in values.items() if value != DEFAULTS[name]]
 
 
 def unusual_networks(config: TrainConfig) -> list[str]:
-    """Return the fields, as `name value`, whose networks no other kind of run can start from."""
+    """Return 'name value' for each changed field that makes networks of a special kind.
+
+    A run with such networks cannot use `init_from`, and no other run can start from them.
+    """
     learner = () if config.algorithm == 'imitation' else ('algorithm',)
     return changed_fields(
         config, (*learner, 'longest_hold', 'advantage', 'subgoal_every', 'quantiles')
@@ -519,10 +528,10 @@ def unusual_networks(config: TrainConfig) -> list[str]:
 
 
 def _rules(config: TrainConfig, spec: TaskSpec) -> Iterator[tuple[bool, str]]:
-    """Yield the rules between fields: whether one is broken, and its message.
+    """Yield each rule between fields: whether it is broken, and its error message.
 
     Raises:
-        ValueError: If goal features or disturbances are unknown.
+        ValueError: If `goal_features` or `disturbances` is invalid.
     """
     c = config
     goal_features(c.goal_features, spec)
@@ -603,7 +612,7 @@ def _rules(config: TrainConfig, spec: TaskSpec) -> Iterator[tuple[bool, str]]:
 
 
 def _rules_of_goals(config: TrainConfig) -> Iterator[tuple[bool, str]]:
-    """Yield the rules about sources of goals."""
+    """Yield each rule between the fields for goal sources, in the form of `_rules`."""
     c, goals, total = config, config.goals, sum(config.goals.values())
     unknown = ', '.join(map(repr, goals.keys() - set(SOURCES)))
     yield bool(unknown), f'goals {goals}: {unknown}; allowed: {", ".join(SOURCES)}'
@@ -639,13 +648,14 @@ _KEPT = 0.99
 
 
 def idle_parts(config: TrainConfig, critic_first: int = 0) -> Iterator[str]:
-    """Yield a line for each part of learning that never happens with these values.
+    """Yield a warning for each part of learning that never happens with these values.
 
-    Three questions: will any update happen, will the targets ever move, will the policy ever act?
+    The checks: updates happen, the target networks move, and collected actions are not noise alone.
 
     Args:
         config: Configuration of the whole run.
-        critic_first: Updates before the actor learns, where the run has more than its field.
+        critic_first: Updates before the actor learns; it counts if it exceeds
+            `config.critic_first`.
     """
     c = config
     spec = task_spec(c.task, control_hz=c.control_hz)

@@ -1,4 +1,7 @@
-"""Fields that users write: in options, `--set`, `train(**fields)`, recipes and stored runs."""
+"""Read and write the fields of `TrainConfig` by name.
+
+Values come from options, `--set`, `train(**fields)`, recipes and stored runs.
+"""
 
 from __future__ import annotations
 
@@ -58,10 +61,11 @@ _OTHER_NAMES = {'total_steps': ('--steps',), 'simulation_threads': ('--threads',
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Field:
-    """The description of a field.
+    """One field of `TrainConfig`, for help texts and parsing.
 
     Attributes:
-        group: Title of its group.
+        meaning: Description of the field, on one line.
+        group: Title of its group in the help.
     """
 
     name: str
@@ -70,27 +74,30 @@ class Field:
 
     @property
     def kind(self) -> Any:
-        """Its type, without a range."""
+        """Type of the field, without its range."""
         return plain_type(TYPES[self.name])
 
     @property
     def default(self) -> Any:
-        """Its default; None for the task."""
+        """Default of the field; None for `task`, which has no default."""
         return DEFAULTS.get(self.name)
 
     @property
     def choices(self) -> tuple[str, ...]:
-        """Allowed values of a field that has a few."""
+        """Allowed values if the field has a fixed set of them, else an empty tuple."""
         return choices_of(TYPES[self.name])
 
     @property
     def limits(self) -> Range | None:
-        """Allowed range of a number."""
+        """Allowed range if the field is a number with limits, else None."""
         return range_of(TYPES[self.name])
 
 
 def _describe() -> dict[str, Field]:
-    """Return the fields with the text below each, on one line, in the order of the groups."""
+    """Return all fields by name, in the order of the groups.
+
+    Titles and descriptions are read from the docstrings in the source of `config.py`.
+    """
     found = {}
     groups = {each.__name__ for each in TrainConfig.__mro__[1:-1]}
     for group in ast.parse(inspect.getsource(config)).body:
@@ -109,19 +116,20 @@ FIELDS = _describe()
 
 
 def to_flat(config: TrainConfig) -> dict[str, Any]:
-    """Return all fields by name."""
+    """Return the values of all fields by name."""
     return {name: getattr(config, name) for name in FIELDS}
 
 
 def from_flat(fields: Mapping[str, Any], **changes: Any) -> TrainConfig:
-    """Build a configuration; fields without effect get their default.
+    """Build a configuration from fields by name; other fields get their default.
 
     Args:
-        fields: A recipe or a stored run.
-        **changes: Fields that the user gave. Each must have an effect or its default.
+        fields: Fields of a recipe or a stored run. One without effect is set to its default.
+        **changes: Fields that the user gave, which replace those in `fields`.
 
     Raises:
-        ValueError: If a field is unknown, a value is not allowed, or fields exclude each other.
+        ValueError: If a field is unknown, a value is not allowed, fields exclude each other, or a
+            value in `changes` has no effect.
     """
     values = types.SimpleNamespace(**{**DEFAULTS, **typed_fields(fields), **typed_fields(changes)})
     if not hasattr(values, 'task'):
@@ -138,18 +146,19 @@ def from_flat(fields: Mapping[str, Any], **changes: Any) -> TrainConfig:
 
 
 def changed(config: TrainConfig, **changes: Any) -> TrainConfig:
-    """Return a configuration with fields replaced.
+    """Return a copy of a configuration with fields replaced.
 
     Raises:
-        ValueError: As `from_flat`.
+        ValueError: If a field is unknown, or a value is not allowed or has no effect.
     """
     return from_flat(to_flat(config), **changes)
 
 
 def config_from_dict(values: Mapping[str, Any], **changes: Any) -> TrainConfig:
-    """Rebuild a configuration that went through JSON; later fields have their default.
+    """Rebuild the configuration of a stored run from JSON values.
 
-    Fields that were removed since are ignored: `removed_fields` returns them.
+    Fields that are newer than the file get their default. Fields removed since are ignored;
+    `removed_fields` returns them.
 
     Raises:
         ValueError: If a field is unknown or a value is not allowed.
@@ -159,15 +168,15 @@ def config_from_dict(values: Mapping[str, Any], **changes: Any) -> TrainConfig:
 
 
 def removed_fields(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the fields of a stored run that had an effect and were removed in version 2.0."""
+    """Return the fields of a stored run that version 2.0 removed, if they were not the default."""
     return {n: values[n] for n, default in REMOVED.items() if values.get(n, default) != default}
 
 
 def typed_fields(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return fields with values of their types.
+    """Return `values` with each value converted to the type of its field.
 
-    Scalars of NumPy become those of Python, lists tuples, whole numbers floats, and texts mixtures
-    of goals or grades.
+    NumPy scalars become Python numbers, lists become tuples and whole numbers floats. The texts of
+    `goals` and `reward_grades` are parsed.
 
     Raises:
         ValueError: If a field is unknown or a value is not of its type.
@@ -204,7 +213,7 @@ def _type_name(kind: Any) -> str:
 
 
 def parse_assignment(text: str) -> tuple[str, Any]:
-    """Parse `name=value` into a flat field and a value of its type.
+    """Parse `name=value`; return the name of the field and the value in its type.
 
     Raises:
         ValueError: If the field is unknown or the value does not fit its type.
@@ -219,7 +228,7 @@ def parse_assignment(text: str) -> tuple[str, Any]:
 
 
 def parse_value(name: str, text: str) -> Any:
-    """Parse the text of a flat field.
+    """Parse `text` into the type of the field `name`.
 
     Raises:
         ValueError: If it does not fit the field's type.
@@ -250,10 +259,10 @@ def _parse(text: str, kind: Any) -> Any:
 
 
 def whole(text: str) -> int:
-    """Read a whole number, also as `1_000_000` and `1e6`.
+    """Parse a whole number, also written as `1_000_000` or `1e6`.
 
     Raises:
-        ValueError: If it is not whole, or a float may have rounded it.
+        ValueError: If it is not whole, or is written as a float above 2**53.
     """
     try:
         return int(text)
@@ -265,7 +274,7 @@ def whole(text: str) -> int:
 
 
 def value_text(value: Any) -> str:
-    """Return the text of a value as `--set` takes it."""
+    """Return a value of a field as text in the form that `--set` reads."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, tuple):
@@ -276,9 +285,13 @@ def value_text(value: Any) -> str:
 
 
 def add_field_options(parser: argparse.ArgumentParser, without: tuple[str, ...]) -> None:
-    """Add an option for each field, `--learning-rate` for `learning_rate`; by default None.
+    """Add an option for each field to `parser`, for example `--learning-rate` for `learning_rate`.
 
-    `--help` shows the fields by group, `--help-research` those of studies.
+    An option that is not given is None. `--help` shows the fields by group, `--help-research` those
+    for studies.
+
+    Args:
+        without: Fields without an option.
     """
     research = argparse.ArgumentParser(
         prog=parser.prog, usage='fields for studies (docs/research)', add_help=False
@@ -330,17 +343,19 @@ def _add_option(group: Any, each: Field) -> None:
 
 
 def given_fields(options: argparse.Namespace) -> dict[str, Any]:
-    """Return the fields that the command line has options for and that were given."""
+    """Return the fields that were given as options on the command line, by name."""
     return {n: value for n, value in vars(options).items() if n in FIELDS and value is not None}
 
 
 def with_assignments(
     given: dict[str, Any], assignments: Iterable[str], options: Mapping[str, str] | None = None
 ) -> dict[str, Any]:
-    """Return the fields given by options and by `--set`.
+    """Return the fields of options and of `--set` together.
 
     Args:
-        assignments: Those of `--set`, `name=value`; the last one of a field counts.
+        given: Fields given by options.
+        assignments: Texts `name=value` of `--set`; the last one for a field counts.
+        options: Option of a field, for messages, if it is not its name with dashes.
 
     Raises:
         ValueError: If an assignment is invalid or contradicts the option of its field.

@@ -1,4 +1,4 @@
-"""The recipes: `paper` (Plappert et al. 2018), `best`, `robust` and `finetune`."""
+"""The recipes, named sets of fields: `paper`, `best`, `robust` and `finetune`."""
 
 from __future__ import annotations
 
@@ -25,24 +25,24 @@ _DECIDE_AT_RATES = (
 
 
 def ticks_of_40_ms(control_hz: float) -> float:
-    """Ticks in 40 ms: steps are counted in these, so that rates can be compared."""
+    """Return the number of ticks in 40 ms, the step in which runs at all rates are measured."""
     return control_hz / DEFAULT_CONTROL_HZ
 
 
 def steps_at_rate(values: Mapping[str, Any], control_hz: float) -> dict[str, Any]:
-    """The fields among these that count steps of 40 ms, in ticks of a rate."""
+    """Return the fields in `values` that count 40 ms steps, converted to ticks at `control_hz`."""
     ticks = ticks_of_40_ms(control_hz)
     return {name: round(values[name] * ticks) for name in STEP_COUNTS if name in values}
 
 
 def recipe_config(task: str, recipe: str, **overrides: Any) -> TrainConfig:
-    """Returns the configuration of a recipe for a task, with fields replaced.
+    """Return the configuration of a recipe for a task, with fields replaced.
 
     Args:
         recipe: `paper` (Plappert et al. 2018, appendix B), `best` (the best measured here from
-            nothing), `robust` (imitation of the shipped policy on a disturbed robot) or `finetune`
-            (continues from a shipped policy with an object in the hand).
-        **overrides: Fields of `TrainConfig`.
+            random networks), `robust` (imitation of the shipped policy on a disturbed robot) or
+            `finetune` (continues from a shipped policy with an object in the hand).
+        **overrides: Fields of `TrainConfig` that replace those of the recipe.
 
     Raises:
         ValueError: If the task, the recipe or a value is not allowed.
@@ -63,8 +63,9 @@ def recipe_config(task: str, recipe: str, **overrides: Any) -> TrainConfig:
 def _at_rate(task: str, values: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
     """Return the changes to `best` that keep the simulated time of a run equal at other rates.
 
-    Above 25 Hz, learning also needs a discount by time, exploration noise that lasts 40 ms and
-    returns that span 40 ms (docs/research/rates).
+    At 25 Hz there are none. Above 25 Hz, learning also needs a discount by time, exploration noise
+    that lasts 40 ms and returns that span 40 ms (docs/research/rates), unless `overrides` decides
+    this.
     """
     control_hz = overrides.get('control_hz', DEFAULT_CONTROL_HZ)
     if control_hz == DEFAULT_CONTROL_HZ:
@@ -79,7 +80,10 @@ def _at_rate(task: str, values: Mapping[str, Any], overrides: Mapping[str, Any])
 
 
 def _paper(task: str) -> dict[str, Any]:
-    """Appendix B and `baselines/her/experiment/config.py`: 19 workers with 2 rollouts each."""
+    """Return the fields of the paper's appendix B and of `baselines/her/experiment/config.py`.
+
+    They are totals of 19 workers with 2 rollouts each.
+    """
     ticks = task_spec(task).episode_ticks
     epochs = 200 if ticks == 100 else 50
     return {
@@ -172,9 +176,10 @@ _EXACT = {'FetchSlide': (0.0, (1.0, 0.5)), 'FetchPickAndPlace': (1.0, (1.0, 1.0,
 
 
 def _robust(task: str) -> dict[str, Any]:
-    """Imitate the shipped policy on a robot with half of `hardware` and 0 to 2 ticks of latency.
+    """Return the fields to imitate the shipped policy on a disturbed robot.
 
-    For exact actions, the critic weighs errors (docs/robust_policies.md).
+    The disturbances are half of `hardware` with 0 to 2 ticks of latency. Tasks in `_EXACT` have
+    other scales, and the critic weighs errors of actions (docs/robust_policies.md).
     """
     scale, in_turn = _EXACT.get(task, (0.5, (1.0,)))
     scaled = PRESETS['hardware'].scaled(scale)
@@ -196,10 +201,11 @@ def _robust(task: str) -> dict[str, Any]:
 
 
 def _object_in_hand(task: str) -> dict[str, Any]:
-    """The tasks with an object in the hand, and those of other packages that are not called Fetch.
+    """Return the fields for tasks with an object in the hand.
 
-    51 samples per environment step, as the paper has. Nothing stays unmoved in a hand. Symmetry
-    doubles the speed of the egg; for the block it is not decided (docs/lab_notes/training_log.md).
+    Third-party tasks whose name does not start with Fetch get them too. Each environment step is
+    followed by 51 samples, as in the paper. Nothing stays unmoved in a hand. Symmetry doubles the
+    speed of the egg; for the block it is not decided (docs/lab_notes/training_log.md).
     """
     spec = task_spec(task)
     return _FETCH | {
@@ -217,10 +223,13 @@ def _object_in_hand(task: str) -> dict[str, Any]:
 
 
 def _finetune(task: str) -> dict[str, Any]:
-    """Fine-tune the shipped policy, which reaches its goals, until it holds them.
+    """Return the fields to train a shipped policy on, so that it holds the goals that it reaches.
 
     Goals that do not depend on outcomes, a short horizon and a slow actor keep the critic from
     overestimating values (docs/lab_notes/training_log.md).
+
+    Raises:
+        ValueError: If the task has no object in the hand.
     """
     if not task.startswith('HandManipulate'):
         raise ValueError(f'recipe finetune is for the tasks with an object in the hand, not {task}')
@@ -248,7 +257,7 @@ def _finetune(task: str) -> dict[str, Any]:
 
 
 def _shipped_networks(task: str) -> dict[str, Any]:
-    """Sizes and inputs of the shipped networks of a task."""
+    """Return the fields that give networks the sizes and inputs of the shipped ones of a task."""
     best = _best(task)
     kept = ('layer_norm', 'goal_features')
     networks: dict[str, Any] = {name: best[name] for name in kept if name in best}

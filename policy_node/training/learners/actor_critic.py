@@ -96,7 +96,7 @@ class ActorCritic:
         return self.plain(self.actor.network)
 
     def evaluation_actor(self) -> Actor:
-        """Return the actor to evaluate, on the CPU: averaged weights, current normalizers."""
+        """Return the actor to evaluate and save, on the CPU, with averaged weights."""
         return self.plain(self.average_actor)
 
     def other_policies(self) -> dict[str, Policy]:

@@ -1,7 +1,8 @@
 """Imitate a policy of the undisturbed robot on a disturbed one (DAgger, Ross et al. 2011).
 
-The imitating policy acts. The imitated policy answers each state as it truly is at the tick in
-which the action arrives, so that latency is learned away; see docs/robust_policies.md.
+The imitating policy acts and observes the disturbed robot. The imitated policy is given the true
+state at the tick at which the action takes effect, and its action is the label. So the imitating
+policy learns to act ahead of latency; see docs/robust_policies.md.
 """
 
 from __future__ import annotations
@@ -34,12 +35,12 @@ from policy_node.training.runs.training_state import RunClock, part_of
 
 
 class Answers:
-    """The newest inputs of the imitating policy and the answers of the imitated one.
+    """Ring buffer of training data: inputs of the imitating policy, actions of the imitated one.
 
     Args:
-        capacity: Most rows kept.
-        sizes: Lengths of the parts of a row: an input, an answer and, where a critic judges
-            actions, the features of the true state in which the action arrives.
+        capacity: Largest number of rows; new rows replace the oldest.
+        sizes: Lengths of the parts of a row: an input, an action and, if a critic weighs errors,
+            the features of the true state at which the action takes effect.
     """
 
     def __init__(self, capacity: int, sizes: Sequence[int]) -> None:
@@ -47,14 +48,14 @@ class Answers:
         self._capacity, self._count = capacity, 0
 
     def add(self, *parts: Tensor) -> None:
-        """Store n rows, given as parts (n, size)."""
+        """Store n rows, given as one tensor (n, size) for each part."""
         rows = (self._count + torch.arange(len(parts[0]))) % self._capacity
         for stored, values in zip(self._parts, parts, strict=True):
             stored[rows] = values
         self._count += len(rows)
 
     def draw(self, count: int) -> list[Tensor]:
-        """Draw `count` random rows; return their parts."""
+        """Draw `count` rows with replacement; return one tensor (count, size) for each part."""
         rows = torch.randint(min(self._count, self._capacity), (count,))
         return [part[rows] for part in self._parts]
 
@@ -65,7 +66,10 @@ def _scaled(config: TrainConfig, scale: float) -> TrainConfig:
 
 
 class ImitationTrainer(BaseTrainer):
-    """One run of imitation.
+    """Trainer for `algorithm=imitation`: one run, in one process.
+
+    Args:
+        init_from: The networks to imitate, from which the imitating actor starts too.
 
     Raises:
         ValueError: With several workers, or if the critic for `value_weight` is missing.
@@ -140,7 +144,7 @@ class ImitationTrainer(BaseTrainer):
                 return reason
 
     def _collect(self) -> float:
-        """Run one episode of each simulation and store the answers; return the success rate."""
+        """Run an episode in each simulation and store the labels; return the success rate."""
         count = self.config.num_envs
         cycle = self.counters.episodes // count
         simulation = self._simulations[cycle % len(self._simulations)]
@@ -180,7 +184,7 @@ class ImitationTrainer(BaseTrainer):
         return self.actor.features(torch.tensor(seen, dtype=torch.float32), goal)
 
     def _learn(self) -> float:
-        """Fit the actor to stored answers; return the mean loss."""
+        """Fit the actor to the stored actions of the imitated policy; return the mean loss."""
         config, total = self.config, 0.0
         left = max(1.0 - self.counters.env_steps / config.total_steps, 0.0)
         share = config.final_learning_rate + (1.0 - config.final_learning_rate) * left

@@ -1,4 +1,4 @@
-"""Networks that a run starts from instead of random ones: read and adapted to its configuration."""
+"""Read the networks that a run starts from with `init_from`, and adapt them to the run."""
 
 from __future__ import annotations
 
@@ -46,10 +46,12 @@ _PREFIXES = tuple(f'{part}.' for part in _CRITICS)
 
 @dataclass(frozen=True, slots=True)
 class InitialNetworks:
-    """Weights and normalisers to start from.
+    """Networks and normalizer statistics that a run starts from instead of random ones.
 
     Attributes:
-        tensors: Named as in a training state, without optimisers and generators.
+        tensors: Named as in a training state, without optimizers and random generators.
+        shape: Sizes and inputs of the actor.
+        goal_features: Value of the field `goal_features` that the networks were trained with.
         origin: Name, task, environment steps and command of their training, for the record.
         critic_config: Configuration with which the critic was trained; None without a critic.
     """
@@ -62,7 +64,7 @@ class InitialNetworks:
 
     @property
     def critics(self) -> int:
-        """Number of critics."""
+        """Number of critics in `tensors`; 0 without a critic."""
         return count_critics(part_of(self.tensors, 'critic'))
 
     def require_fit(self, config: TrainConfig) -> None:
@@ -77,18 +79,19 @@ class InitialNetworks:
             raise ValueError(f'{config.task} cannot start from {origin}: {"; ".join(differing)}')
 
     def fitted(self, config: TrainConfig) -> InitialNetworks:
-        """Return these networks, adapted to another run.
+        """Return a copy adapted to a run with this configuration.
 
-        - A critic is left out if its hidden layers have another normalisation, or its values
+        - A critic is left out if its hidden layers have another normalization or its values
           another meaning. A critic with another `gamma` stays; `critic_first` lets it adapt.
-        - Past actions may become inputs.
+        - Past actions may be added as inputs.
         - If the object's position counts only in the new task, the weights of the goal position
-          become zero. In the old task it equalled that of the object, so the networks have learnt
-          nothing from it. An actor that dropped 1 block in 200 would drop half.
-        - A condition input gets zero weights.
+          become zero. In the old task the goal position equalled that of the object, so the
+          networks have learnt nothing from it. Otherwise an actor that dropped 1 block in 200
+          would drop half.
+        - A condition input may be added. Added inputs have zero weights.
 
         Raises:
-            ValueError: If the run cannot start from them.
+            ValueError: If the run cannot start from these networks.
         """
         self.require_fit(config)
         before, now = task_spec(self.origin['task']), task_spec(config.task)
@@ -111,14 +114,14 @@ class InitialNetworks:
         return fitted._with_critics(0)
 
     def _shape_in(self, config: TrainConfig) -> NetworkShape:
-        """Return the shape with the past actions of a run, or with their own if they have some."""
+        """Return `shape` with the past actions of a run, if the networks have none."""
         past = self.shape.past_actions or config.past_actions
         return replace(self.shape, past_actions=past)
 
     def _with_past_of(self, config: TrainConfig) -> InitialNetworks:
-        """Return these networks with the past actions of a run as inputs, if they have none.
+        """Return a copy with the past actions of a run as inputs; `self` if it needs no change.
 
-        The weights of these inputs start at zero; the normaliser starts at mean 0 and deviation 1.
+        The weights of these inputs start at zero; the normalizer starts at mean 0 and deviation 1.
         """
         shape = self._shape_in(config)
         if shape == self.shape:
@@ -138,7 +141,10 @@ class InitialNetworks:
         return replace(self, tensors=tensors, shape=shape)
 
     def _with_critics(self, critics: int) -> InitialNetworks:
-        """Return these networks with tensor names for `critics` critics; some may be missing."""
+        """Return a copy for a run with `critics` critics, whose tensors are named as in that run.
+
+        Surplus critics are left out; missing ones stay missing until `completed`. 0 removes all.
+        """
         given = {part: part_of(self.tensors, part) for part in _CRITICS}
         if critics == 1 == self.critics and not is_ensemble(given['critic']):
             return self
@@ -153,7 +159,7 @@ class InitialNetworks:
         return replace(self, tensors=tensors, origin=self.origin | known)
 
     def completed(self, learner: ActorCritic) -> dict[str, Tensor]:
-        """Return the tensors, with those of the learner for missing critics."""
+        """Return all tensors; critics that are missing here are those of `learner`."""
         tensors = dict(self.tensors)
         for part, module in learner.modules().items():
             given = part_of(tensors, part)
@@ -164,7 +170,7 @@ class InitialNetworks:
 
 
 def _described(shape: NetworkShape, goal_features: str) -> dict[str, object]:
-    """Return sizes and inputs of networks by name."""
+    """Return sizes and inputs of networks, by the names used in messages."""
     return {
         'observation': shape.observation_size,
         'goal': shape.goal_size,
@@ -178,12 +184,12 @@ def _described(shape: NetworkShape, goal_features: str) -> dict[str, object]:
 
 
 def read_initial_networks(name: str) -> InitialNetworks:
-    """Read the networks called `name`.
+    """Read the networks that the field `init_from` names.
 
     Args:
-        name: A run folder, for its latest networks; a shipped actor; or the file of an actor. The
-            critic of an actor is in `<Task>.training.safetensors` beside it, or in the training
-            state of its run folder.
+        name: A run folder, for its latest networks; the name of a shipped actor; or the file of an
+            actor. The critic of an actor is in `<Task>.training.safetensors` beside it, or in the
+            training state of its run folder.
 
     Raises:
         ValueError: If the actor or run is missing or damaged.
@@ -246,7 +252,12 @@ def _of_actor(name: str, path: Path) -> InitialNetworks:
 
 
 def _read_usual(file: Path, source: Path) -> tuple[TrainingState, TrainConfig]:
-    """Read a training state; raise ValueError if no other run can start from its networks."""
+    """Read a training state from `file` and return it with its configuration.
+
+    Raises:
+        ValueError: If it is damaged, or other runs cannot start from such networks. The message
+            names `source`.
+    """
     state = read_state(file)
     config = config_from_dict(state.extra['config'])
     if found := unusual_networks(config):
@@ -255,7 +266,10 @@ def _read_usual(file: Path, source: Path) -> tuple[TrainingState, TrainConfig]:
 
 
 def _unconditioned(tensors: dict[str, Tensor], config: TrainConfig) -> dict[str, Tensor]:
-    """Return networks without their condition input, fixed at its value for acting."""
+    """Return networks without the input of `condition`; it is fixed at its value for acting.
+
+    Networks without such an input are returned unchanged.
+    """
     value = acting_input(config)
     if value is None:
         return tensors
@@ -263,7 +277,7 @@ def _unconditioned(tensors: dict[str, Tensor], config: TrainConfig) -> dict[str,
 
 
 def _sums(mean: Tensor, std: Tensor, count: int) -> dict[str, Tensor]:
-    """Return the sums of `RunningStatistics` after `count` inputs of this mean and deviation."""
+    """Return the sums of `RunningStatistics` for `count` inputs of this mean and deviation."""
     number = torch.tensor([float(max(count, 1))], dtype=torch.float64)
     mean, std = mean.double(), std.double()
     square = (std.square() + mean.square()) * number
@@ -273,7 +287,7 @@ def _sums(mean: Tensor, std: Tensor, count: int) -> dict[str, Tensor]:
 def steps_behind(run: dict[str, Any]) -> int:
     """Return the environment steps of an actor and of all networks that it started from.
 
-    Each run counts once, with its latest actor.
+    If several actors come from one run, the run counts once, with its latest actor.
 
     Args:
         run: `env_steps` and `init_from`, as in the JSON file of an actor.
@@ -291,7 +305,11 @@ def steps_behind(run: dict[str, Any]) -> int:
 
 
 def _run_of(part: dict[str, Any], steps: int) -> object:
-    """Return a key that all actors of a run share: its folder, if one is named."""
+    """Return a key that is equal for all actors of a run.
+
+    It contains the folder of the run, or without a folder the hash or name of the actor and
+    `steps`.
+    """
     name = part.get('name', '')
     if name and ',' not in name:
         if name.endswith('.safetensors'):

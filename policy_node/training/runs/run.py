@@ -1,4 +1,4 @@
-"""One run from start to end: its start networks, folder lock, signals, log and curve."""
+"""One run from start to end: its initial networks, folder lock, signals, log and curve."""
 
 from __future__ import annotations
 
@@ -59,11 +59,12 @@ _EXPERIENCE_FIELDS = 'seed control_hz reward_type discount gamble'.split()
 
 @dataclass(slots=True)
 class Caller:
-    """A Python program that calls `train`. Its second Ctrl-C raises KeyboardInterrupt.
+    """The Python program that called `train`. Its second Ctrl-C raises KeyboardInterrupt.
 
     Attributes:
-        on_cycle: Called after each cycle, or None.
-        error: Exception of `on_cycle`; it ends the run.
+        on_cycle: Function to call after each cycle with its row, or None.
+        quiet: Show no progress.
+        error: Exception that `on_cycle` raised, which ended the run; None without one.
     """
 
     on_cycle: OnCycle | None = None
@@ -72,15 +73,17 @@ class Caller:
 
 
 class RunTakenError(TrainingError):
-    """Another process trains in the folder."""
+    """Raised if another process trains in the folder of the run."""
 
 
 @dataclass(frozen=True, slots=True)
 class Ending:
-    """The end of a run, or of one part of it.
+    """The end of a run, or of a part of it that may be resumed later.
 
     Attributes:
-        signal: Number of the signal that stopped it; 0 without a signal.
+        reason: The reason in words.
+        counters: Progress of the run at its end.
+        signal: Number of the signal that stopped the run; 0 without a signal.
     """
 
     reason: str
@@ -91,7 +94,11 @@ class Ending:
 def resumed_config(
     folder: Path, task: str | None, recipe: str | None, changes: Mapping[str, Any]
 ) -> TrainConfig:
-    """Return the configuration of a run to resume, with changed fields.
+    """Return the configuration of the run in `folder`, with `changes`, to resume it.
+
+    Args:
+        task: Task that the user gave, which must be that of the run; None if not given.
+        recipe: Recipe that the user gave, which must be that of the run; None if not given.
 
     Raises:
         ValueError: If the folder contains no run, `task` or `recipe` differ from it, or a field
@@ -125,12 +132,15 @@ def train_run(
     """Train in this process until a limit is reached or a signal arrives.
 
     Args:
+        output: Folder of the run.
         resume: Continue the run in the folder; otherwise the folder must contain no run.
-        caller: The calling Python program; None for a command.
+        command: Command line or call that started the run, for the record.
+        experience: Logged episodes to learn from as well; None for none.
+        caller: The calling Python program; None if a command started the run.
 
     Raises:
-        ValueError: If a requirement is missing or does not fit. Only the folder and its lock are
-            written.
+        ValueError: If an argument is invalid or does not fit the run. Nothing was trained; only the
+            folder and its lock exist.
         RunTakenError: If another process trains in the folder.
         TrainingError: If training fails; the last checkpoint stays.
     """
@@ -170,7 +180,7 @@ def _make_trainer(
     resume: bool,
     experience: Episodes | None,
 ) -> AnyTrainer:
-    """Return the trainer with its start state and logged episodes.
+    """Return a trainer that is ready to train, with initial networks, resumed state and episodes.
 
     Raises:
         ValueError: If something does not fit the configuration or the memory of the machine.
@@ -195,9 +205,9 @@ def _make_trainer(
 
 
 def _warn_of_memory(trainer: Trainer) -> None:
-    """Warn if the replay will exceed the memory of this worker hours later.
+    """Warn if the replay, once full, will exceed the free memory of this machine.
 
-    Linux grants memory before it is used.
+    Linux reserves memory without checking it, so the run would fail only after hours.
     """
     replay, available = trainer.experience.replay, available_memory()
     left = max(trainer.config.total_steps - trainer.counters.env_steps, 0)
@@ -241,7 +251,10 @@ def _train(
 
 
 def _prepare_folder(trainer: AnyTrainer, output: Path, command: str, resume: bool) -> None:
-    """Set files of an earlier run aside, record the command, warn of idle parts and emulation."""
+    """Move files of an earlier run away, and record the command of this one.
+
+    It also warns of parts of learning that never happen and of an emulated `bfloat16`.
+    """
     if not resume and (note := set_former_run_aside(output)):
         complain(NAME, note)
     if not resume or trainer.counters.env_steps < trainer.config.total_steps:
@@ -259,7 +272,10 @@ def _prepare_folder(trainer: AnyTrainer, output: Path, command: str, resume: boo
 
 
 def _row_listener(trainer: AnyTrainer, caller: Caller | None) -> Callable[[Row], None] | None:
-    """Return the function that passes each row to the caller, or None."""
+    """Return a function that calls `on_cycle` with each row; None if the caller has no `on_cycle`.
+
+    The run stops after the cycle if `on_cycle` returns False or raises an exception.
+    """
     if caller is None or (on_cycle := caller.on_cycle) is None:
         return None
 
@@ -278,9 +294,10 @@ def _row_listener(trainer: AnyTrainer, caller: Caller | None) -> Callable[[Row],
 
 @contextlib.contextmanager
 def lock_run(folder: Path) -> Iterator[None]:
-    """Create the folder of a run and keep other processes out of it.
+    """Create the folder of a run and keep other processes from training in it.
 
-    The lock ends with the process. Some file systems of clusters have no locks; then a line warns.
+    The lock is released at the end of the block or of the process. If the file system does not
+    support locks, the run continues with a warning.
 
     Raises:
         ValueError: If the folder cannot be created or written.
@@ -303,13 +320,13 @@ def lock_run(folder: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _stop_on_signals(trainer: AnyTrainer, is_guest: bool = False) -> Iterator[list[int]]:
-    """End the run after the cycle on Ctrl-C, SIGTERM or SIGHUP, and at once on a second signal.
+    """Stop the run on Ctrl-C, SIGTERM or SIGHUP: after the cycle, or at once on the second signal.
 
     Args:
         is_guest: A second Ctrl-C raises KeyboardInterrupt instead of ending the process.
 
     Yields:
-        A list that gets the number of the signal.
+        A list to which the number of the received signal is added.
     """
 
     def stop(number: int, frame: FrameType | None) -> None:

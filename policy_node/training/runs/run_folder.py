@@ -1,4 +1,4 @@
-"""The files of a run: best and latest actor, training state, replay."""
+"""The folder of a run: best and latest actor, training state and replay."""
 
 from __future__ import annotations
 
@@ -38,12 +38,12 @@ REPLAY_SECONDS = 900.0
 
 
 def default_folder(config: TrainConfig) -> Path:
-    """Return the default folder of a run."""
+    """Return the folder of a run without `--output`: runs/<task>_<recipe>_seed<seed>."""
     return Path('runs') / f'{config.task}_{config.recipe}_seed{config.seed}'
 
 
 def companion_file(actor: Path) -> Path:
-    """Return the file of the critic beside a shipped actor."""
+    """Return the path of the critic that belongs to a shipped actor, beside its file."""
     return actor.with_suffix('.training.safetensors')
 
 
@@ -53,7 +53,7 @@ def set_former_run_aside(folder: Path) -> str:
     Otherwise the new run would append to its log or keep its best actor.
 
     Returns:
-        A sentence about the moved files; '' without files.
+        A sentence that names both folders; '' if there were no files.
     """
     names = (BEST_FILE, LATEST_FILE, PROGRESS_FILE, CURVE_FILE, BOARD_FOLDER)
     found = [folder / name for name in names if (folder / name).exists()]
@@ -70,11 +70,13 @@ def set_former_run_aside(folder: Path) -> str:
 
 @dataclass(slots=True)
 class RunFolder:
-    """Save the actors and the training state of a run, on one of several workers.
+    """Writes the actors, the training state and the replay of a run on one worker.
 
     Attributes:
-        workers: This worker among all. Only the first one writes actors and the state.
-        init_from: Origin of the first networks; empty if they were random.
+        path: The folder.
+        workers: Rank of this worker. Only the first worker writes actors and the training state.
+        command: Command line or call that started the run, for the record.
+        init_from: Origin of the initial networks; empty if they were random.
     """
 
     path: Path
@@ -87,12 +89,15 @@ class RunFolder:
     _last_replay: float = field(default_factory=time.monotonic)
 
     def replay_file(self) -> Path:
-        """Return the file for the newest episodes of this worker."""
+        """Return the path of the file with the newest episodes of this worker."""
         rank = self.workers.rank
         return self.path / (REPLAY_FILE if rank == 0 else f'{rank}.{REPLAY_FILE}')
 
     def keep_best(self, outcomes: EpisodeOutcomes, actor: Actor, counters: Counters) -> None:
-        """Save an evaluated actor if its success is higher, or equal with a higher return."""
+        """Save an evaluated actor if its success, or at equal success its return, is the highest.
+
+        `counters` gets the new best success and return.
+        """
         rule = self.config.success_rule
         success = success_rate(outcomes, rule)
         mean_return = float(outcomes.episode_return.mean())
@@ -105,10 +110,10 @@ class RunFolder:
             self.save_actor(BEST_FILE, actor, counters.env_steps, measured)
 
     def read_best(self, counters: Counters) -> None:
-        """Take the best success of a resumed run from its best actor, which may be newer.
+        """Set the best success and return in `counters`, of a resumed run, from its best actor.
 
-        If the actor is missing, damaged, of another task or had another evaluation, the next
-        evaluated actor replaces it.
+        The best actor may be newer than the training state. If it is missing, damaged, of another
+        task or was evaluated otherwise, both are reset, and the next evaluated actor replaces it.
         """
         file, rule = self.path / BEST_FILE, self.config.success_rule
         if counters.best_success < 0 and not file.is_file():
@@ -132,7 +137,10 @@ class RunFolder:
     def save_when_due(
         self, learner: ActorCritic, experience: Experience, counters: Counters
     ) -> None:
-        """Save every `checkpoint_seconds`, the replay less often; report a full disk."""
+        """Save if `checkpoint_seconds` have passed, the replay less often.
+
+        If a file cannot be written, for example on a full disk, only warn.
+        """
         now = time.monotonic()
         if now - self._last_checkpoint < self.config.checkpoint_seconds:
             return
@@ -149,7 +157,7 @@ class RunFolder:
         counters: Counters,
         with_replay: bool = True,
     ) -> None:
-        """Write the newest episodes and, as the first worker, the latest actor and the state.
+        """Write a checkpoint: the newest episodes and, on the first worker, latest actor and state.
 
         Raises:
             OSError: If a file cannot be written; the earlier files stay.
@@ -168,7 +176,7 @@ class RunFolder:
     def save_actor(
         self, name: str, actor: Actor, env_steps: int, success: dict[str, Any] | None = None
     ) -> None:
-        """Write an actor with its metadata to the file `name`, with its measured success if any."""
+        """Write an actor with metadata to the file `name`; `success` is its evaluation, if any."""
         config, spec = self.config, task_spec(self.config.task)
         info = ActorInfo(
             task=config.task,

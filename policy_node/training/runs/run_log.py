@@ -1,4 +1,4 @@
-"""The log of a run: a live line, CSV, TensorBoard if installed, and the curve as PNG."""
+"""The log of a run: a live line in the terminal, CSV, TensorBoard if installed, curve as PNG."""
 
 from __future__ import annotations
 
@@ -53,12 +53,16 @@ _PLAIN_INTERVAL = 15.0
 
 
 class RunLog:
-    """Write one row per cycle; a resumed run appends to the same file.
+    """Writes one row per cycle to `progress.csv`, TensorBoard and the terminal.
 
     Args:
+        output: Folder of the run. A resumed run appends to its log.
+        total_steps: Environment steps of the whole run, for the remaining time.
         time_limit: Time limit of the run, seconds; 0 means none.
         resumed_steps: Environment steps of the checkpoint that the run resumes from. Later rows are
             removed, because the run repeats these steps.
+        quiet: Show nothing in the terminal.
+        on_row: Function to call with each row.
     """
 
     def __init__(
@@ -94,7 +98,7 @@ class RunLog:
             self._live.start()
 
     def write(self, row: Row) -> None:
-        """Record one cycle; None leaves a column empty.
+        """Write the row of one cycle; a value of None leaves its column empty.
 
         Raises:
             OSError: If the row cannot be written.
@@ -109,7 +113,7 @@ class RunLog:
             self._on_row(row)
 
     def close(self) -> None:
-        """End the live line and close the files."""
+        """Finish the live line in the terminal and close the files."""
         discard_unread_output()
         if self._live.is_started:
             self._live.stop()
@@ -146,7 +150,7 @@ class RunLog:
 
 
 def evaluation_columns(outcomes: EpisodeOutcomes | None, success_rule: str) -> Row:
-    """Return the values of an evaluation by column; none without an evaluation."""
+    """Return the results of an evaluation by column of `progress.csv`; empty if it is None."""
     if outcomes is None:
         return {}
     found = {f'eval_{n}': value for n, value in diagnose(outcomes).items() if n != 'long_way_share'}
@@ -159,7 +163,7 @@ def evaluation_columns(outcomes: EpisodeOutcomes | None, success_rule: str) -> R
 
 
 def loss_columns(losses: Sequence[Losses]) -> Row:
-    """Return the means of the losses of a cycle by column."""
+    """Return the mean losses of a cycle by column of `progress.csv`; None without updates."""
     found: Row = {}
     for name, column in _LOSS_COLUMNS.items():
         values = [getattr(loss, name) for loss in losses]
@@ -178,16 +182,16 @@ def _clock(seconds: float) -> str:
 
 
 def _rows_until(path: Path, env_steps: int) -> list[dict[str, str]]:
-    """Return the rows of a log up to `env_steps`, as text."""
+    """Return the rows of a log up to `env_steps`, as text; none for 0 steps or without a log."""
     if env_steps == 0 or not path.is_file():
         return []
     return [row for row, numbers in _valid_rows(path) if numbers['env_steps'] <= env_steps]
 
 
 def _valid_rows(path: str | Path) -> Iterator[tuple[dict[str, str], dict[str, float]]]:
-    """Yield the rows of a log as text and as numbers, without empty columns.
+    """Yield each row of a log twice: as text, and as numbers without empty columns.
 
-    A killed run can cut the last row short. Such rows and damaged ones are left out.
+    Damaged rows are left out, also a last row that a killed run has cut short.
     """
     with open(path, newline='', encoding='utf-8', errors='replace') as file, suppress(csv.Error):
         for row in csv.DictReader(file):
@@ -200,9 +204,10 @@ def _valid_rows(path: str | Path) -> Iterator[tuple[dict[str, str], dict[str, fl
 
 
 class _Board:
-    """A TensorBoard event file, written without the thread of TensorBoard's own writers.
+    """A TensorBoard event file.
 
-    An error in that thread would print a traceback.
+    It is written without TensorBoard's own writers: an error in their thread would print a
+    traceback.
     """
 
     def __init__(self, folder: Path, resumed_steps: int) -> None:
@@ -219,7 +224,7 @@ class _Board:
         self._write(step=resumed_steps + 1, session_log=start)
 
     def write(self, row: Row) -> None:
-        """Write the values of a cycle."""
+        """Write the values of a cycle at its environment steps."""
         values = [
             self._summary.Value(tag=name, simple_value=value)
             for name, value in row.items()
@@ -244,12 +249,12 @@ def _tensorboard(output: Path, resumed_steps: int) -> _Board | None:
 
 
 def read_progress(path: str | Path) -> list[dict[str, float]]:
-    """Read `progress.csv` without empty columns and damaged rows."""
+    """Read the rows of `progress.csv` as numbers, without empty columns and damaged rows."""
     return [numbers for _, numbers in _valid_rows(path)]
 
 
 def draw_curve(rows: Sequence[dict[str, float]], title: str, file: str | Path | IO[bytes]) -> None:
-    """Draw success against environment steps as PNG."""
+    """Draw the success rates against environment steps and write them to `file` as PNG."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(6.4, 4.0), layout='constrained')

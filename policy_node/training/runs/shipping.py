@@ -1,4 +1,4 @@
-"""Copy an actor of a run into the package, with its evaluation, critic and curve."""
+"""Ship an actor: copy it from a run into the package, with its evaluation, critic and curve."""
 
 from __future__ import annotations
 
@@ -46,8 +46,14 @@ def ship(
 ) -> bool:
     """Evaluate an actor of a run and copy it with its files if it beats the shipped actor.
 
+    Args:
+        run: Folder of the run.
+        actors: Folder of the shipped actors.
+        episodes: Number of evaluated episodes.
+        name: File of the actor in `run`.
+
     Returns:
-        Whether the actor is now shipped.
+        True if this actor is now the shipped one, also if it was before.
 
     Raises:
         ValueError: If the actor or its log is missing or damaged, or the shipped actor has another
@@ -112,7 +118,7 @@ def ship(
 
 
 def _read_log(log: Path) -> list[dict[str, float]]:
-    """Return the rows of the log of a run; raise ValueError if it is missing or has none."""
+    """Return the rows of the log of a run; raise ValueError if it cannot be read or has no row."""
     try:
         progress = read_progress(log)
     except OSError as error:
@@ -130,7 +136,11 @@ def _write(
     progress: list[dict[str, float]],
     info: ActorInfo,
 ) -> None:
-    """Write the actor with critic, curve and evaluation: all or none."""
+    """Write the shipped actor with its critic, curve and evaluation: all files or none.
+
+    Without a training state, the critic of the former actor is removed. The curve of a mean of
+    networks is written only if none exists.
+    """
     files = {target: actor}
     if state is not None:
         files[companion_file(target)] = _critic_bytes(state, sha256(actor))
@@ -150,9 +160,9 @@ def _write(
 
 
 def _critic_bytes(state: TrainingState, actor_sha256: str) -> bytes:
-    """Return the file of the critic, from which another training can start.
+    """Return the contents of the file with the critic, so that other runs can start from the actor.
 
-    The actor file contains the normalisers; optimisers start fresh.
+    The actor file contains the normalizers; optimizers start fresh.
     """
     tensors = {name: value for name, value in state.tensors.items() if name.startswith('critic.')}
     extra = {'config': state.extra['config'], 'actor_sha256': actor_sha256}
@@ -160,7 +170,7 @@ def _critic_bytes(state: TrainingState, actor_sha256: str) -> bytes:
 
 
 def _require_rate(target: Path, control_hz: float) -> None:
-    """Raise ValueError if the shipped actor has another action frequency."""
+    """Raise ValueError if the shipped actor `target` exists and has another action frequency."""
     if not target.is_file():
         return
     shipped = checkpoint.read_info(target).control_hz
@@ -172,7 +182,7 @@ def _require_rate(target: Path, control_hz: float) -> None:
 
 
 def _read_evaluation(file: Path) -> dict[str, Any]:
-    """Return the evaluation of a shipped actor; empty without an actor.
+    """Return the evaluation of a shipped actor from its JSON file; empty if the file is missing.
 
     Raises:
         ValueError: If the file contains no evaluation.

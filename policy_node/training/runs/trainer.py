@@ -59,7 +59,14 @@ MOST_REFILLED = 100_000
 
 @dataclass(frozen=True, slots=True)
 class Collected:
-    """The episodes of one cycle, and its evaluation if one was due."""
+    """The episodes of one cycle, with the evaluation if one was due.
+
+    Attributes:
+        train_success: Success rate of these episodes, with exploration noise.
+        evaluation: Outcomes of the evaluation; None if none was due.
+        evaluated: The evaluated actor.
+        others: Success rates of further policies, by column of `progress.csv`.
+    """
 
     episodes: Episodes
     train_success: float
@@ -69,10 +76,10 @@ class Collected:
 
 
 class BaseTrainer:
-    """Parts of every run: simulations, folder, counters and end.
+    """Base class of trainers: simulations, run folder, counters and the end of a run.
 
     Args:
-        origin: Origin of the first networks; empty if they are random.
+        origin: Origin of the initial networks, for the record; empty if they are random.
     """
 
     def __init__(
@@ -98,7 +105,7 @@ class BaseTrainer:
         return make_simulation(config, count, self._threads)
 
     def stop(self, reason: str) -> None:
-        """End the run after the current cycle, with a checkpoint."""
+        """Make the run end after the current cycle, with a checkpoint; `reason` is in words."""
         self._stop_reason = reason
 
     def _reason_to_stop(self) -> str:
@@ -109,7 +116,14 @@ class BaseTrainer:
     def _row(
         self, train_success: float, outcomes: EpisodeOutcomes | None, samples: int, seconds: float
     ) -> Row:
-        """Return the row of a cycle that took so many seconds and learnt from so many samples."""
+        """Return the row of a cycle for `progress.csv`.
+
+        Args:
+            train_success: Success rate of the collected episodes.
+            outcomes: The evaluation; None if none was due.
+            samples: Number of transitions learnt from, over all workers.
+            seconds: Wall-clock time of the cycle.
+        """
         counters, workers = self.counters, self.workers
         steps = workers.share(self.config.num_envs) * self.spec.episode_ticks * workers.world_size
         return {
@@ -126,7 +140,7 @@ class BaseTrainer:
 
 
 class Trainer(BaseTrainer):
-    """One run of one configuration, on one of several workers.
+    """Runs the training loop of one configuration, on one of several workers.
 
     Args:
         init_from: Networks to start from; None starts from random ones.
@@ -159,11 +173,14 @@ class Trainer(BaseTrainer):
         self._clock = RunClock(self.counters)
 
     def modules(self) -> dict[str, nn.Module]:
-        """Return networks and statistics, by their names in a training state."""
+        """Return networks and normalizer statistics by their names in a training state."""
         return {**self.learner.modules(), **self.experience.statistics}
 
     def _seed(self, env_steps: int) -> np.random.Generator:
-        """Seed resets and exploration for a run at `env_steps`; return the generator of batches."""
+        """Make a collector with new seeds, and return a random generator for batches.
+
+        Both depend on the seed of the run, the worker and `env_steps`.
+        """
         config = self.config
         seeds = np.random.SeedSequence([config.seed, self.workers.rank, env_steps])
         collector_seeds, sampler_seed = seeds.spawn(2)
@@ -172,16 +189,17 @@ class Trainer(BaseTrainer):
         return np.random.default_rng(sampler_seed)
 
     def _part_noise(self) -> None:
-        """Give workers with equal networks different noise."""
+        """Seed torch differently on each worker, so that equal networks get different noise."""
         rank = self.workers.rank
         if rank > 0:
             seeds = np.random.SeedSequence([self.config.seed, rank, self.counters.env_steps])
             torch.manual_seed(int(seeds.generate_state(1)[0]))
 
     def resume(self, path: Path) -> None:
-        """Continue from a training state and the episodes beside it.
+        """Continue from the training state in the file `path` and the replay beside it.
 
-        If the episodes are missing, the run first collects as many. They do not count as steps.
+        If the replay is missing, the run first collects as many episodes. They do not count as
+        steps.
 
         Raises:
             ValueError: If the file does not fit the configuration.
@@ -213,7 +231,10 @@ class Trainer(BaseTrainer):
             )
 
     def _let_critic_learn_first(self) -> None:
-        """Train only the critics at first, if some of them started from random weights."""
+        """Let the critics learn alone for `CRITIC_FIRST` updates if some of them started random.
+
+        A `critic_first` in the configuration has priority.
+        """
         origin = self._folder.init_from
         critics = self.config.critics
         known = origin.get('critics', critics if origin.get('critic', True) else 0)
@@ -221,10 +242,10 @@ class Trainer(BaseTrainer):
             self.learner.critic_first = CRITIC_FIRST
 
     def add_experience(self, episodes: Episodes) -> None:
-        """Put logged episodes into the replay; each worker takes its share.
+        """Add logged episodes to the replay; each worker takes its share.
 
-        They do not count as environment steps. Normalisers learn from them too, unless the run was
-        resumed and may have seen them.
+        They do not count as environment steps. They are also added to the statistics of the
+        normalizers, except in a resumed run, whose statistics may contain them already.
 
         Raises:
             ValueError: If they do not fit into the replay.
@@ -236,7 +257,7 @@ class Trainer(BaseTrainer):
             self.experience.normalize(share, self.learner.actor)
 
     def train(self, log: RunLog | None = None) -> str:
-        """Train until a limit is reached or `stop` is called; return the reason.
+        """Train until a limit is reached or `stop` is called; return the reason in words.
 
         Raises:
             TrainingError: If a loss, a weight or an observation is not finite. Earlier checkpoints
@@ -263,7 +284,10 @@ class Trainer(BaseTrainer):
     def _run_cycle(
         self, collected: Collected, executor: ThreadPoolExecutor, log: RunLog | None
     ) -> Collected:
-        """Store and learn from the episodes of one cycle; collect those of the next meanwhile."""
+        """Learn from the episodes of one cycle and collect those of the next; return the latter.
+
+        With `overlap`, both happen at the same time.
+        """
         before = time.monotonic()
         self._store(collected)
         if self.config.overlap:
@@ -289,7 +313,7 @@ class Trainer(BaseTrainer):
         return collected
 
     def _warn_of_rewards(self, episodes: Episodes) -> None:
-        """Warn if rewards of a third-party task exceed 0: values are clipped to 0."""
+        """Warn if rewards of a third-party task exceed 0, because values are clipped to 0."""
         metric = self.simulation.metric
         if self.config.algorithm == 'ppo' or not metric.has_own_reward:
             return
@@ -303,10 +327,9 @@ class Trainer(BaseTrainer):
             )
 
     def _collect_first(self, executor: ThreadPoolExecutor) -> Collected | None:
-        """Fill the replay of a resumed run if it is missing, then collect the first cycle.
+        """Collect episodes until the replay of a resumed run is filled; return one more cycle.
 
-        Returns:
-            The first cycle; None if the run is stopped before.
+        Return None if the run is stopped before.
         """
         while True:
             actor, _ = self._prepare_collection(may_evaluate=False)
@@ -319,7 +342,10 @@ class Trainer(BaseTrainer):
                 return None
 
     def _prepare_collection(self, may_evaluate: bool = True) -> tuple[Policy, Candidate | None]:
-        """Prepare collection; return the policy that collects and the actor to evaluate."""
+        """Set the exploration noise; return the policy that collects, and the actor to evaluate.
+
+        The actor is None if no evaluation is due, or `may_evaluate` is False.
+        """
         counters, steps = self.counters, self.counters.env_steps
         self.collector.exploration = self._exploration()
         policy, candidate = self.learner.acting_policy(), None
@@ -329,7 +355,7 @@ class Trainer(BaseTrainer):
         return policy, candidate
 
     def _candidate(self) -> Candidate | None:
-        """Return the actor to evaluate and others beside it; None on workers but the first."""
+        """Return the actor to evaluate and further policies; None except on the first worker."""
         if not self.workers.is_first:
             return None
         return self.learner.evaluation_actor(), self.learner.other_policies()
@@ -346,7 +372,7 @@ class Trainer(BaseTrainer):
         return replace(collected, evaluation=outcomes, evaluated=actor, others=rates)
 
     def _exploration(self) -> float:
-        """Return the present share of exploration noise and random actions."""
+        """Return the factor on exploration noise and random actions for now, 0 ... 1."""
         left = 3.0 * (1.0 - self.counters.env_steps / self.config.total_steps)
         final = self.config.final_exploration
         return final + (1.0 - final) * min(max(left, 0.0), 1.0)
@@ -359,7 +385,7 @@ class Trainer(BaseTrainer):
         return collected
 
     def _store(self, collected: Collected) -> None:
-        """Put new episodes into the replay and the normalisers."""
+        """Add collected episodes to the replay, the counters and the normalizers."""
         episodes = collected.episodes
         if len(episodes):
             self.experience.replay.add(episodes)
@@ -370,7 +396,7 @@ class Trainer(BaseTrainer):
         self._narrow()
 
     def _narrow(self) -> None:
-        """Set the width of rewarded goals for the progress of the run."""
+        """Set the success thresholds of the reward for the progress of the run."""
         self.experience.narrow(self.counters.env_steps / self.config.total_steps)
 
     def _learn(self) -> list[Losses]:
@@ -403,11 +429,11 @@ class Trainer(BaseTrainer):
             self._folder.keep_best(outcomes, actor, self.counters)
 
     def _ended(self) -> tuple[str, str] | None:
-        """Return the field that ends the run and the reason in words, or None."""
+        """Return the field whose limit is reached, and the reason in words; else None."""
         return ended_by(self.config, self.counters)
 
     def save(self) -> None:
-        """Write the newest episodes and, as the first worker, the latest actor and the state.
+        """Write a checkpoint: the newest episodes and, on the first worker, latest actor and state.
 
         Raises:
             OSError: If a file cannot be written; the earlier files stay.
@@ -417,7 +443,7 @@ class Trainer(BaseTrainer):
 
 @contextmanager
 def _collecting_thread() -> Iterator[ThreadPoolExecutor]:
-    """Provide a thread for collection; after Ctrl-C, do not wait for its job."""
+    """Provide an executor with one thread for collection; after Ctrl-C, do not wait for its job."""
     # torch counts threads per thread. With its default, the collector's small products would start
     # one per core, and these would slow down simulation and learner.
     executor = ThreadPoolExecutor(1, 'collector', torch.set_num_threads, (1,))

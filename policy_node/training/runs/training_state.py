@@ -1,4 +1,4 @@
-"""The training state of a run: networks, optimisers, normalisers and counters in one file."""
+"""The training state of a run: networks, optimizers, normalizers and counters in one file."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _ADAM = {'step', 'exp_avg', 'exp_avg_sq'}
 
 @dataclass(slots=True)
 class Counters:
-    """The progress of a run, over all its parts.
+    """The progress of a run since its first start, also over interruptions.
 
     Attributes:
         env_steps: Environment steps of all workers.
@@ -43,7 +43,7 @@ class Counters:
         updates: Gradient updates.
         seconds: Wall-clock time.
         processor_seconds: CPU time of all threads of this process.
-        best_success: Best evaluated success; -1 before the first evaluation.
+        best_success: Best evaluated success rate; -1 before the first evaluation.
         best_return: Mean return of that evaluation.
         next_evaluation: Environment steps at which the next evaluation is due.
     """
@@ -59,7 +59,7 @@ class Counters:
 
 
 def ended_by(limits: Limits, counters: Counters) -> tuple[str, str] | None:
-    """Return the field that ends a run and the reason in words, or None."""
+    """Return the field whose limit is reached, and the reason in words; else None."""
     if 0 < limits.success_target <= counters.best_success:
         return 'success_target', f'success target {limits.success_target:g} reached'
     if counters.env_steps >= limits.total_steps:
@@ -70,7 +70,10 @@ def ended_by(limits: Limits, counters: Counters) -> tuple[str, str] | None:
 
 
 class RunClock:
-    """Write wall-clock and CPU time into the counters of a run, including its earlier parts."""
+    """Measures the wall-clock and CPU time of a run and writes it into its counters.
+
+    The time of earlier parts of a resumed run is included.
+    """
 
     def __init__(self, counters: Counters) -> None:
         self._counters = counters
@@ -78,19 +81,19 @@ class RunClock:
         self._cpu_start = time.process_time() - counters.processor_seconds
 
     def update(self) -> None:
-        """Set `seconds` and `processor_seconds`."""
+        """Set `seconds` and `processor_seconds` of the counters to the time until now."""
         self._counters.seconds = time.monotonic() - self._wall_start
         self._counters.processor_seconds = time.process_time() - self._cpu_start
 
 
 @dataclass(frozen=True, slots=True)
 class TrainingState:
-    """The contents of a file.
+    """The contents of a training state file.
 
     Attributes:
         tensors: By part and name, for example `critic.network.output.bias`.
         counters: Progress of the run.
-        extra: JSON values: configuration, command, origin of the first networks.
+        extra: JSON values: configuration, command, origin of the initial networks.
     """
 
     tensors: dict[str, Tensor]
@@ -105,7 +108,10 @@ def save_state(
     counters: Counters,
     extra: dict[str, Any],
 ) -> None:
-    """Write all that a resumed run needs, except the replay; `extra` contains JSON values."""
+    """Write all that a resumed run needs, except the replay, to the file `path`.
+
+    `statistics` are those of the normalizers, by name; `extra` contains JSON values.
+    """
     tensors: dict[str, Tensor] = {'torch_generator': torch.get_rng_state()}
     for part, module in {**learner.modules(), **statistics}.items():
         for name, value in module.state_dict().items():
@@ -118,7 +124,7 @@ def save_state(
 
 
 def state_bytes(state: TrainingState) -> bytes:
-    """Return the contents of the file of a state."""
+    """Return a training state as the bytes of its file."""
     metadata = {'format': FORMAT, 'format_version': str(FORMAT_VERSION)}
     metadata |= {
         'counters': json.dumps(asdict(state.counters)),
@@ -128,10 +134,9 @@ def state_bytes(state: TrainingState) -> bytes:
 
 
 def require_readable(learner: ActorCritic) -> None:
-    """Reject networks whose files would be too large to read, before hours of training.
+    """Raise ValueError if the networks would make files that are too large to be read again.
 
-    Raises:
-        ValueError: If a file would be too large.
+    This is checked before hours of training.
     """
     actor = sum(value.nbytes for value in learner.actor.state_dict().values())
     modules, optimizers = learner.modules().values(), learner.optimizers().values()
@@ -149,7 +154,7 @@ def require_readable(learner: ActorCritic) -> None:
 
 
 def read_counters(path: Path) -> Counters:
-    """Read only the progress of a run.
+    """Read only the progress of a run from its training state file.
 
     Raises:
         ValueError: If the file is not a training state of this version, or damaged.
@@ -158,7 +163,7 @@ def read_counters(path: Path) -> Counters:
 
 
 def read_state(path: Path) -> TrainingState:
-    """Read a training state.
+    """Read a training state file.
 
     Raises:
         ValueError: If the file is not a training state of this version, or damaged.
@@ -204,12 +209,14 @@ def _counters(values: Any) -> Counters:
 
 
 def is_finite(value: object) -> TypeGuard[int | float]:
-    """Return whether a value from a file is a finite number; booleans are not."""
+    """Return whether a value is a finite number; a bool counts as no number."""
     return isinstance(value, int | float) and type(value) is not bool and math.isfinite(value)
 
 
 def load_state(path: Path, learner: ActorCritic, modules: dict[str, nn.Module]) -> TrainingState:
-    """Load a file into a learner and modules, and return its contents.
+    """Load a training state file into `modules` and into the optimizers of `learner`; return it.
+
+    The random generator of torch is restored too.
 
     Raises:
         ValueError: If the file is not a training state or its tensors do not fit.
@@ -228,7 +235,7 @@ def load_state(path: Path, learner: ActorCritic, modules: dict[str, nn.Module]) 
 
 @contextmanager
 def fitting(source: object) -> Iterator[None]:
-    """Turn errors of loading tensors into one line that names their source.
+    """Turn errors from loading tensors into a one-line ValueError that names `source`.
 
     Raises:
         ValueError: If the tensors do not fit.
@@ -245,7 +252,10 @@ def fitting(source: object) -> Iterator[None]:
 
 
 def load_networks(tensors: dict[str, Tensor], modules: dict[str, nn.Module]) -> None:
-    """Load networks and statistics; without a critic the run keeps its own.
+    """Load tensors into networks and statistics.
+
+    Target networks and the averaged actor may be missing: they become copies. If the critic is
+    missing, the module keeps its weights.
 
     Raises:
         RuntimeError: If sizes do not fit or a part is incomplete.
@@ -257,7 +267,7 @@ def load_networks(tensors: dict[str, Tensor], modules: dict[str, nn.Module]) -> 
 
 
 def part_of(tensors: dict[str, Tensor], part: str) -> dict[str, Tensor]:
-    """Return the tensors of one part, by their names in it."""
+    """Return the tensors whose names start with `part` and a dot, without this prefix."""
     prefix = f'{part}.'
     return {
         name.removeprefix(prefix): value
@@ -267,7 +277,10 @@ def part_of(tensors: dict[str, Tensor], part: str) -> dict[str, Tensor]:
 
 
 def _with_copies(tensors: dict[str, Tensor], modules: Iterable[str]) -> dict[str, Tensor]:
-    """Add targets and average if they are missing, as copies of actor and critic."""
+    """Add missing target networks and the averaged actor as copies of actor and critic.
+
+    `modules` are the names of the parts that a run needs.
+    """
     sources = {
         'target_actor': 'actor.network',
         'average_actor': 'actor.network',
@@ -307,7 +320,7 @@ class TrainingError(RuntimeError):
 
 
 def require_finite(values: Iterable[tuple[str, Any]], counters: Counters) -> None:
-    """Raise `TrainingError` if one of the named arrays or tensors is not finite."""
+    """Raise `TrainingError` if one of the named arrays or tensors contains NaN or infinity."""
     for name, value in values:
         if not np.isfinite(np.asarray(value)).all():
             raise TrainingError(
