@@ -24,10 +24,6 @@ from policy_node.policies.policy import LoadedPolicy
 REACH = task_spec('FetchReach')
 
 
-def resting():
-    return load_policy('resting', 'FetchReach')
-
-
 class Wire:
     """A subscriber that can be disconnected."""
 
@@ -53,12 +49,26 @@ def episode():
 @pytest.fixture
 def case(episode):
     wire = Wire()
-    return Responder(resting(), episode[0], wire, lambda: 7.0), wire, episode[1]
+    policy = load_policy('resting', 'FetchReach')
+    return Responder(policy, episode[0], wire, lambda: 7.0), wire, episode[1]
+
+
+@pytest.fixture
+def health(case, episode):
+    """The health of a robot whose first tick was answered."""
+    found = Health('/arm/policy_node')
+    found.start(case[0], episode[0], 6.0)
+    feed(case[0], case[2][0])
+    return found
+
+
+def receive(responder, tick):
+    for source in responder.topics:
+        responder.receive(source.name, tick[source.name])
 
 
 def feed(responder, tick):
-    for source in responder.topics:
-        responder.receive(source.name, tick[source.name])
+    receive(responder, tick)
     responder.answer()
 
 
@@ -96,16 +106,37 @@ def test_a_command_without_a_subscriber_is_sent_once_later(case):
     assert len(wire.sent) == responder.answered == 1
 
 
-def test_state_that_is_not_finite_is_refused_and_the_next_tick_answered(case):
+def test_invalid_state_is_refused_and_the_next_tick_answered(case):
+    """Values that no observation needs may be missing, for example efforts."""
     responder, wire, ticks = case
-    source = topic(REACH, 'end_effector_pose')
-    bad = dict(ticks[0])
-    stamp, vector = TopicCodec(source).decode(bad[source.name])
-    bad[source.name] = TopicCodec(source).encode(stamp, [math.nan, *vector[1:]])
-    with pytest.raises(ValueError, match='end_effector_pose'):
-        feed(responder, bad)
-    feed(responder, ticks[1])
-    assert (responder.unusable, len(wire.sent)) == (1, 1)
+    pose, joints = topic(REACH, 'end_effector_pose'), topic(REACH, 'joint_states')
+
+    def changed(tick, source, values):
+        stamp, vector = TopicCodec(source).decode(tick[source.name])
+        for index, value in values.items():
+            vector[index] = value
+        return {**tick, source.name: TopicCodec(source).encode(stamp, vector)}
+
+    feed(responder, changed(ticks[0], joints, {-1: math.nan}))
+    assert len(wire.sent) == 1
+
+    def in_frame(tick, frame):
+        message = deserialize(pose.type_name, tick[pose.name])
+        message.header.frame_id = frame
+        return {**tick, pose.name: serialize(pose.type_name, message)}
+
+    for bad, line in (
+        (changed(ticks[1], pose, {0: math.nan}), 'end_effector_pose'),
+        (in_frame(ticks[2], 'base_link'), 'base_link'),
+        (
+            changed(ticks[3], joints, {len(joints.names) - 1: math.inf}),
+            f'joint_states: no finite position of {joints.names[-1]}$',
+        ),
+    ):
+        with pytest.raises(ValueError, match=line):
+            feed(responder, bad)
+    feed(responder, in_frame(ticks[4], ''))
+    assert (responder.unusable, len(wire.sent)) == (3, 2)
 
 
 def test_clock_jumps(case):
@@ -233,8 +264,7 @@ def test_a_policy_that_fails_once_answers_the_next_tick(case, episode):
 def test_only_the_newest_waiting_tick_is_answered(case):
     responder, wire, ticks = case
     for tick in ticks:
-        for source in responder.topics:
-            responder.receive(source.name, tick[source.name])
+        receive(responder, tick)
     assert responder.is_due
     responder.answer()
     assert not responder.is_due
@@ -256,67 +286,25 @@ def test_a_second_publisher_of_a_topic_does_not_stop_the_policy(case, stamp):
     assert len(wire.sent) == len(ticks)
 
 
-def test_values_that_no_observation_needs_may_be_missing(case):
-    """For example efforts. A missing position is an error."""
-    responder, wire, ticks = case
-    source = topic(REACH, 'joint_states')
-    stamp, vector = TopicCodec(source).decode(ticks[0]['joint_states'])
-    count = len(source.names)
-    vector[2 * count :] = math.nan
-    feed(responder, ticks[0] | {'joint_states': TopicCodec(source).encode(stamp, vector)})
-    assert len(wire.sent) == 1
-    vector[count - 1] = math.inf
-    bad = ticks[1] | {'joint_states': TopicCodec(source).encode(stamp + 40_000_000, vector)}
-    finger = source.names[-1]
-    with pytest.raises(ValueError, match=f'joint_states: no finite position of {finger}$'):
-        feed(responder, bad)
-
-
-def test_a_pose_in_another_frame_is_no_state(case):
+def test_two_robots_that_publish_in_turn_are_reported_within_two_seconds(case, health):
     responder, _, ticks = case
-    source = topic(REACH, 'end_effector_pose')
-    message = deserialize(source.type_name, ticks[0][source.name])
-    for frame, is_refused in (('base_link', True), ('', False), ('world', False)):
-        message.header.frame_id = frame
-        data = serialize(source.type_name, message)
-        if is_refused:
-            with pytest.raises(ValueError, match='base_link'):
-                responder.receive(source.name, data)
-        else:
-            responder.receive(source.name, data)
-    assert responder.unusable == 1
-
-
-def test_two_robots_that_publish_in_turn_are_reported_within_two_seconds(case, episode):
-    responder, _, ticks = case
-    health, now = Health('/policy_node'), 1.0
-    health.report(now, 1)
-    health.start(responder, episode[0], now)
+    health.report(7.0, 1)
     publishers = {'/joint_states': 2}
     names = [source.name for source in responder.topics]
     for name in names:
         # A robot that was killed and its successor.
         responder.receive(name, moved(ticks[0], name, 10**12))
         responder.receive(name, moved(ticks[0], name, 10**9))
-    assert '2 robots' not in health.report(2.0, 2, publishers=publishers).message
+    assert '2 robots' not in health.report(8.0, 2, publishers=publishers).message
     for step in range(3):
         for name in names:
             responder.receive(name, moved(ticks[0], name, 10**12 + step))
             responder.receive(name, moved(ticks[0], name, 10**9 + step))
-    assert '2 robots publish here' in health.report(3.0, 2, publishers=publishers).message
+    assert '2 robots publish here' in health.report(9.0, 2, publishers=publishers).message
 
 
-def test_the_report_names_the_problem(case, episode):
+def test_the_report_names_the_problem(case, health):
     responder, _, ticks = case
-    health = Health('/policy_node')
-    assert health.report(7.0, 0).message == 'waits for a robot'
-    report = health.report(7.0, 0, elsewhere=['/arm1', '/arm2'])
-    assert report.message == (
-        'no robot here: found in /arm1, /arm2; join it with --ros-args -r __ns:=/arm1'
-    )
-    assert health.news(report) and not health.news(health.report(7.0, 0, elsewhere=['/arm1']))
-    health.start(responder, episode[0], 6.0)
-    feed(responder, ticks[0])
     health.report(7.0, 1)
     feed(responder, ticks[1])
     report = health.report(8.0, 1)
@@ -330,6 +318,13 @@ def test_the_report_names_the_problem(case, episode):
     late = 'slow inference: 100.000 ms, a tick is 40.0 ms'
     assert late in health.report(14.0, 1).message, 'without a pace it is real time'
     assert 'no robot publishes episode_status' in health.report(15.0, 0).message
+    health.stop()
+    assert health.report(7.0, 0).message == 'waits for a robot'
+    report = health.report(7.0, 0, elsewhere=['/arm1', '/arm2'])
+    assert report.message == (
+        'no robot here: found in /arm1, /arm2; join it with --ros-args -r __ns:=/arm1'
+    )
+    assert health.news(report) and not health.news(health.report(7.0, 0, elsewhere=['/arm1']))
 
 
 def test_a_restarted_robot_counts_once_and_two_robots_count_twice():
@@ -343,10 +338,10 @@ def test_a_restarted_robot_counts_once_and_two_robots_count_twice():
     assert '2 robots publish here' in Health('/policy_node').report(5.0, 2).message
 
 
-def test_a_robot_in_slow_motion_is_not_silent(episode):
-    status, ticks = episode
-    now = [0.0]
-    responder, health = Responder(resting(), status, Wire(), lambda: now[0]), Health('/policy_node')
+def test_a_robot_in_slow_motion_is_not_silent(case, episode):
+    (_, wire, ticks), status, now = case, episode[0], [0.0]
+    policy = load_policy('resting', 'FetchReach')
+    responder, health = Responder(policy, status, wire, lambda: now[0]), Health('/policy_node')
     health.start(responder, status, 0.0)
     for tick in ticks:
         feed(responder, tick)
@@ -360,11 +355,7 @@ def diagnostics(*reports):
     return deserialize('diagnostic_msgs/msg/DiagnosticArray', encode_reports(*reports))
 
 
-def test_a_paused_robot_is_not_silent(case, episode):
-    responder, _, ticks = case
-    health = Health('/arm/policy_node')
-    health.start(responder, episode[0], 6.0)
-    feed(responder, ticks[0])
+def test_a_paused_robot_is_not_silent(health):
     message = diagnostics(Report('/arm/sim_node', 'FetchReach', {'paused': 'True'}, 'is paused'))
     pace = read_pace(message, '/arm')
     assert pace and pace.is_paused
@@ -384,13 +375,9 @@ def test_a_paused_robot_is_not_silent(case, episode):
         ({'rate asked (Hz)': '0.00'}, 0.0),
     ],
 )
-def test_inference_is_slow_relative_to_the_pace_of_the_robot(case, episode, values, period):
-    responder, _, ticks = case
-    health = Health('/policy_node')
-    health.start(responder, episode[0], 6.0)
-    feed(responder, ticks[0])
-    responder.inference.add(0.06)
-    responder.inference.add(0.06)
+def test_inference_is_slow_relative_to_the_pace_of_the_robot(case, health, values, period):
+    for _ in range(2):
+        case[0].inference.add(0.06)
     report = Report('/sim_node', 'FetchReach', {'paused': 'False', **values}, 'runs')
     pace = read_pace(diagnostics(report), '/')
     assert pace == Pace(is_paused=False, period=period)
