@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import cast
@@ -24,8 +25,8 @@ from policy_node.training.learners.ddpg import (
 _MOMENTUM = 0.01
 # TQC drops 2 of 25 quantiles for every critic (its table of hyperparameters, most tasks).
 _DROPPED_SHARE = 2 / 25
-# Prefix of the tensors of an `Ensemble`.
-_MEMBERS = 'members.'
+# Names of the tensors of an `Ensemble`.
+_MEMBER = re.compile(r'members\.(\d+)\.(.+)')
 
 Aggregate = Callable[[Tensor], Tensor]
 
@@ -55,43 +56,22 @@ class Ensemble(nn.Module):
         members = cast(Iterable[Critic], self.members)
         return torch.stack([member.outputs(features, action) for member in members])
 
-    def completed(self, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Return `tensors`, completed with this ensemble's own for members that are missing."""
-        given = {_member_of(name) for name in tensors}
-        own = self.state_dict().items()
-        return {name: value for name, value in own if _member_of(name) not in given} | tensors
+
+def members_of(tensors: dict[str, Tensor]) -> list[dict[str, Tensor]]:
+    """Return the tensors of each critic, from those of a `Critic` or an `Ensemble`."""
+    members: dict[int, dict[str, Tensor]] = {}
+    for name, value in tensors.items():
+        found = _MEMBER.fullmatch(name)
+        index, own = (int(found[1]), found[2]) if found else (0, name)
+        members.setdefault(index, {})[own] = value
+    return [members[index] for index in sorted(members)]
 
 
-def critic_tensors(tensors: dict[str, Tensor], critics: int) -> dict[str, Tensor]:
-    """Rename the tensors of one critic or an ensemble for an ensemble of another size.
-
-    Args:
-        tensors: Tensors of a `Critic` or an `Ensemble`.
-        critics: New number of critics; members beyond it are left out.
-    """
-    if not is_ensemble(tensors):
-        tensors = {f'{_MEMBERS}0.{name}': value for name, value in tensors.items()}
+def as_one(members: list[dict[str, Tensor]], critics: int) -> dict[str, Tensor]:
+    """Return the tensors of members, named as in a learner of one critic or of several."""
     if critics == 1:
-        first = f'{_MEMBERS}0.'
-        return {n.removeprefix(first): v for n, v in tensors.items() if n.startswith(first)}
-    return {name: value for name, value in tensors.items() if _member_of(name) < critics}
-
-
-def is_ensemble(tensors: dict[str, Tensor]) -> bool:
-    """Return whether the names are those of an `Ensemble`, maybe of one member."""
-    return any(name.startswith(_MEMBERS) for name in tensors)
-
-
-def count_critics(tensors: dict[str, Tensor]) -> int:
-    """Return the number of critics with these tensors."""
-    if not is_ensemble(tensors):
-        return 1 if tensors else 0
-    return len({_member_of(name) for name in tensors})
-
-
-def _member_of(name: str) -> int:
-    """Return the index of the `Ensemble` member to which the tensor `name` belongs."""
-    return int(name.removeprefix(_MEMBERS).split('.')[0])
+        return members[0]
+    return {f'members.{i}.{n}': value for i, m in enumerate(members) for n, value in m.items()}
 
 
 class EnsembleLoss(CriticLoss):

@@ -35,26 +35,19 @@ from policy_node.training.research import (
     rollouts,
 )
 from policy_node.training.research.conditions import acting_input, without_input
-from policy_node.training.research.critics import (
-    Ensemble,
-    count_critics,
-    critic_tensors,
-    is_ensemble,
-)
+from policy_node.training.research.critics import as_one, members_of
 from policy_node.training.research.frequent_actions import plain_actor
 from policy_node.training.research.ppo import PPO
 
 __all__ = [
-    'Ensemble',
     'acting_input',
-    'count_critics',
-    'critic_tensors',
-    'is_ensemble',
+    'as_one',
     'make_collector',
     'make_ddpg',
     'make_learner',
     'make_sampler',
     'make_simulation',
+    'members_of',
     'network_shape',
     'plain_actor',
     'without_input',

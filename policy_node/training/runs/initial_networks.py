@@ -18,11 +18,9 @@ from policy_node.training.configuration.config import TrainConfig, unusual_netwo
 from policy_node.training.configuration.flat import config_from_dict
 from policy_node.training.learners.actor_critic import ActorCritic, first_weights, with_inputs
 from policy_node.training.research.registry import (
-    Ensemble,
     acting_input,
-    count_critics,
-    critic_tensors,
-    is_ensemble,
+    as_one,
+    members_of,
     network_shape,
     without_input,
 )
@@ -65,7 +63,7 @@ class InitialNetworks:
     @property
     def critics(self) -> int:
         """Number of critics in `tensors`; 0 without a critic."""
-        return count_critics(part_of(self.tensors, 'critic'))
+        return len(members_of(part_of(self.tensors, 'critic')))
 
     def require_fit(self, config: TrainConfig) -> None:
         """Raise ValueError if a run with this configuration cannot start from these networks."""
@@ -145,27 +143,25 @@ class InitialNetworks:
 
         Surplus critics are left out; missing ones stay missing until `completed`. 0 removes all.
         """
-        given = {part: part_of(self.tensors, part) for part in _CRITICS}
-        if critics == 1 == self.critics and not is_ensemble(given['critic']):
-            return self
         tensors = {n: v for n, v in self.tensors.items() if not n.startswith(_PREFIXES)}
         if not critics:
             origin = self.origin | {'critic': False}
             return replace(self, tensors=tensors, origin=origin, critic_config=None)
-        for part, values in given.items():
-            named = critic_tensors(values, critics)
-            tensors |= {f'{part}.{name}': value for name, value in named.items()}
-        known = {'critics': min(critics, self.critics)}
+        for part in _CRITICS:
+            if members := members_of(part_of(self.tensors, part)):
+                kept = as_one(members[:critics], critics)
+                tensors |= {f'{part}.{name}': value for name, value in kept.items()}
+        known = {} if critics == self.critics == 1 else {'critics': min(critics, self.critics)}
         return replace(self, tensors=tensors, origin=self.origin | known)
 
     def completed(self, learner: ActorCritic) -> dict[str, Tensor]:
         """Return all tensors; critics that are missing here are those of `learner`."""
         tensors = dict(self.tensors)
         for part, module in learner.modules().items():
-            given = part_of(tensors, part)
-            if given and isinstance(module, Ensemble):
-                completed = module.completed(given)
-                tensors |= {f'{part}.{name}': value for name, value in completed.items()}
+            if given := members_of(part_of(self.tensors, part)):
+                own = members_of(module.state_dict())
+                complete = as_one(given + own[len(given) :], len(own))
+                tensors |= {f'{part}.{name}': value for name, value in complete.items()}
         return tensors
 
 

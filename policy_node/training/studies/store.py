@@ -76,17 +76,6 @@ def holds(runs: Runs, job: Job) -> bool:
     return not differing_fields(run['config'], job.config)
 
 
-def _differing_runs(run: Run, job: Job) -> dict[str, str]:
-    """Return the configuration fields in which a stored run and a job differ, in words.
-
-    Seeds may differ. Unlike `differing_fields`, it compares the start networks (`init_from`), too.
-    """
-    before, now = run['config'].get('init_from', ''), job.config.init_from
-    start = {} if before == now else {'init_from': f'init_from {before!r}, now {now!r}'}
-    stored = {**run['config'], 'seed': job.config.seed}
-    return {**differing_fields(stored, job.config), **start}
-
-
 def own_fields(study: Study) -> set[str]:
     """Return the fields in which variants of a study may differ."""
     own = {name for arm in study.arms for name in arm.own}
@@ -105,7 +94,11 @@ def require_alike(study: Study, jobs: Sequence[Job], folder: Path) -> None:
         for (task, arm), run in examples.items():
             if task != job.config.task:
                 continue
-            differing = _differing_runs(run, job)
+            stored, start = {**run['config'], 'seed': job.config.seed}, job.config.init_from
+            differing = differing_fields(stored, job.config)
+            # Between runs of different places, the start counts too.
+            if (before := stored.get('init_from', '')) != start:
+                differing['init_from'] = f'init_from {before!r}, now {start!r}'
             if arm != job.arm.name:
                 differing = {name: text for name, text in differing.items() if name not in own}
             if differing:

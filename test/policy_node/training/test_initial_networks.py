@@ -96,7 +96,8 @@ def test_a_position_that_now_counts_has_no_effect_at_first(tmp_path, block_run, 
         torch.equal(fitted[k], v) for k, v in networks.tensors.items() if 'hidden.0.w' not in k
     )
     block = read_initial_networks(str(block_run))
-    assert block.fitted(tiny('HandManipulateBlockRotateParallel')) is block
+    parallel = block.fitted(tiny('HandManipulateBlockRotateParallel'))
+    assert same(parallel.tensors, block.tensors) and parallel.origin == block.origin
 
 
 @pytest.mark.parametrize('condition', ['threshold', 'horizon'])
