@@ -120,7 +120,7 @@ class _Dataset:
         rows: Sequence[Row],
         where: dict[str, int],
     ) -> list[Histogram]:
-        """Write the film of some episodes and add its place to their rows."""
+        """Write one film file of several episodes; add file and times to their rows."""
         path = self._file(_FILM, video_key=camera.key, **where)
         colors = write_episodes(path, episodes, camera, self.rate)
         begins = accumulate((row['length'] for row in rows), initial=0)
@@ -174,7 +174,7 @@ class _Dataset:
 
 
 def _files(episodes: Sequence[Columns]) -> Iterator[list[Columns]]:
-    """Yield the episodes of each file."""
+    """Divide the episodes among files of limited size."""
     group: list[Columns] = []
     size = 0
     for columns in episodes:
@@ -188,7 +188,7 @@ def _files(episodes: Sequence[Columns]) -> Iterator[list[Columns]]:
 
 
 def _column(values: NDArray[Any]) -> Any:
-    """Return a column of numbers, or of vectors of fixed size; (n, 1) becomes numbers."""
+    """Convert an array to an Arrow column: numbers for (n,) and (n, 1), else fixed-size lists."""
     pyarrow = require_module('pyarrow')
     flat = pyarrow.array(values.ravel())
     if values.ndim == 1 or values.shape[1] == 1:
@@ -197,7 +197,7 @@ def _column(values: NDArray[Any]) -> Any:
 
 
 def _flat(found: Row) -> Row:
-    """Return statistics by column and kind as the entries of one row."""
+    """Flatten statistics {column: {kind: value}} to the entries `stats/<column>/<kind>`."""
     return {
         f'stats/{name}/{kind}': value
         for name, kinds in found.items()
@@ -255,7 +255,7 @@ def _feature(dtype: str, names: list[str] | None = None) -> dict[str, Any]:
 
 
 def _parts(spec: TaskSpec) -> tuple[list[str], list[str]]:
-    """Return the names of the observed numbers of the robot, and of its object."""
+    """Return the names of the observed values of the robot, and those of the object."""
     robot: list[str] = []
     rest: list[str] = []
     for part in spec.observation:

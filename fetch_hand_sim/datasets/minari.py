@@ -33,7 +33,11 @@ _MINARI_PATH, _NAMESPACE = 'MINARI_DATASETS_PATH', 'namespace_metadata.json'
 
 
 def dataset_name(text: str) -> str:
-    """Return the name of a dataset, `-v0` added without a version, or raise UsageError."""
+    """Check the name of a dataset and return it; `-v0` is appended if it has no version.
+
+    Raises:
+        UsageError: If Minari does not allow the name.
+    """
     *folders, _ = text.split('/')
     # A folder with a version is a dataset, and Minari finds no dataset within it.
     if not _DATASET_NAME.fullmatch(text) or any(map(_VERSION.search, folders)):
@@ -127,7 +131,7 @@ def _create_dataset(
 
 @contextmanager
 def _unmeasured() -> Iterator[None]:
-    """Keep Minari from measuring all files of a dataset after every episode."""
+    """For the body, stop Minari from adding up all file sizes after every episode."""
     storage = require_module('minari.dataset.minari_storage').MinariStorage
     measure = storage.get_size
     storage.get_size = lambda dataset: 0.0

@@ -164,7 +164,7 @@ class _Decoder:
         return stamps, vectors
 
     def _steps(self, name: str, stamps: NDArray[np.int64]) -> Array:
-        """Return the vectors of a topic that starts with the first step."""
+        """Return the vectors of a topic that has no message at the reset, one per step."""
         if len(stamps) == 1:
             return np.zeros((0, topic(self._task, name).size))
         return self._decoded(name, self._file.rows(name), stamps, first=1)
@@ -172,7 +172,7 @@ class _Decoder:
     def _decoded(
         self, name: str, rows: MessageRows, stamps: NDArray[np.int64], first: int
     ) -> Array:
-        """Return the vectors of a topic without stamps; log times give the ticks."""
+        """Return the vectors of a topic without stamps; the log times tell their ticks."""
         count = len(stamps) - first
         ticks = np.searchsorted(stamps, rows.log_times[:count], side='right') - 1
         if not np.array_equal(ticks, np.arange(first, len(stamps))):

@@ -82,7 +82,7 @@ def offered_qos_text(spec: QosSpec) -> str:
 
 
 def checked_strings(content: Mapping[str, str]) -> dict[str, str]:
-    """Return a copy of a metadata record, or raise ValueError if readers would reject it."""
+    """Copy the contents of a metadata record; raise ValueError if readers would reject it."""
     size = sum(len(text.encode()) for item in content.items() for text in item)
     if size > MAX_METADATA_BYTES:
         raise ValueError(f'{size} bytes of episode metadata; allowed: {MAX_METADATA_BYTES}')
@@ -93,7 +93,7 @@ def checked_strings(content: Mapping[str, str]) -> dict[str, str]:
 
 @dataclass(slots=True)
 class _Channel:
-    """A topic of a bag, by its resolved name."""
+    """A channel of the MCAP file: one topic under its full name."""
 
     name: str
     topic: TopicSpec
@@ -104,7 +104,7 @@ class _Channel:
 class BagFile:
     """One episode as an MCAP file in an open stream, which the caller flushes and closes.
 
-    `OSError`s of the stream are passed on and end the file. The records that identify the episode
+    An `OSError` of the stream is raised and ends the file. The records that identify the episode
     are written at once, so that a cut-off file contains them.
     """
 
@@ -179,7 +179,7 @@ class BagFile:
         )
 
     def flush(self) -> None:
-        """End the chunk in progress and hand everything to the operating system."""
+        """End the current chunk and write everything to the operating system."""
         self._flushes += self.has_unflushed
         self.has_unflushed = False
         self._writer.flush()  # type: ignore[no-untyped-call]
@@ -254,7 +254,7 @@ class _Quoted(str):
 
 
 class _Dumper(_SafeDumper):  # type: ignore[misc]
-    """Writes repeated parts in full instead of as anchors."""
+    """YAML dumper that writes repeated parts in full, without anchors and aliases."""
 
     def ignore_aliases(self, data: Any) -> bool:
         return True

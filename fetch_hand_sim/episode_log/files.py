@@ -1,4 +1,4 @@
-"""Find episodes, and the steps in which their files are claimed, written and shown.
+"""Find episodes; create, lock, store and name their files.
 
 An episode is written in the hidden directory `.<name>.active`, which gets its name when it is
 complete. Recovery moves files without messages to `.<name>.aside`.
@@ -93,7 +93,7 @@ def metadata_file(directory: Path) -> Path:
 
 
 def is_mcap(path: Path) -> bool:
-    """Return whether a name is that of an MCAP file; macOS puts `._` files beside them."""
+    """Return whether a path has the name of an MCAP file; `._` files of macOS do not count."""
     return path.suffix == '.mcap' and not path.name.startswith('._')
 
 
@@ -125,7 +125,7 @@ def _is_bag(path: Path) -> bool:
 
 
 def folders_below(directory: Path) -> str:
-    """Return the names of the first folders in a directory that contain episodes."""
+    """List, for an error, the first subfolders of a directory that contain episodes."""
     try:
         folders = [path for path in sorted(directory.iterdir()) if path.is_dir()]
         held = [path for path in folders if path.name[0] != '.' and find_episodes(path)]
@@ -219,7 +219,7 @@ def require_free_space(directory: Path, minimum_bytes: int) -> None:
 
 
 def lock(stream: IO[bytes]) -> None:
-    """Mark a file as being written for as long as this process lives and keeps it open."""
+    """Lock a file as being written, until this process closes it or ends."""
     # File systems without locks only lose the distinction between running and cut-off episodes.
     with suppress(OSError):
         fcntl.flock(stream, fcntl.LOCK_EX)
@@ -257,7 +257,7 @@ def is_locked(path: Path) -> bool:
 
 
 def sync_directory(path: Path) -> None:
-    """Bring the entries of a directory to the disk."""
+    """Flush the entries of a directory to the disk (fsync)."""
     descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(descriptor)
@@ -266,7 +266,7 @@ def sync_directory(path: Path) -> None:
 
 
 def store(stream: IO[bytes], directory: Path, description: str) -> None:
-    """Bring a finished MCAP file and its `metadata.yaml` to the disk."""
+    """Write `metadata.yaml` and flush it and the finished MCAP file to the disk (fsync)."""
     stream.flush()
     os.fsync(stream.fileno())
     with create(metadata_file(directory)) as text:
@@ -276,7 +276,7 @@ def store(stream: IO[bytes], directory: Path, description: str) -> None:
 
 
 def publish(active: Path, final: Path) -> None:
-    """Give a complete episode its name, in one step that a crash leaves done or not done."""
+    """Rename the hidden directory of a complete episode to its name, atomically."""
     sync_directory(active)
     active.rename(final)
     sync_directory(final.parent)

@@ -125,7 +125,7 @@ def _check_data_crc(data: bytes, position: int, end: int) -> None:
 
 
 def _check_footer(data: bytes, summary: Summary, summary_start: int) -> None:
-    """Check that readers which start at the footer find the summary that follows the data."""
+    """Check that the footer points at the summary that follows the data."""
     footers = summary[Opcode.FOOTER]
     if len(footers) != 1 or footers[0][1] != len(data) - len(MCAP0_MAGIC):
         raise ValueError('truncated or damaged: the file does not end with one footer')
@@ -166,7 +166,7 @@ def _check_record_indexes(data: bytes, summary: Summary, contents: Contents) -> 
 def _check_chunk_indexes(
     data: bytes, summary: Summary, contents: Contents, messages: Messages
 ) -> None:
-    """Check that the chunk indexes contain all chunks, or none, as they are."""
+    """Check that the chunk indexes list no chunk or all, with their true places and sizes."""
     _check_chunk_times(contents, messages)
     if not summary[Opcode.CHUNK_INDEX]:
         return

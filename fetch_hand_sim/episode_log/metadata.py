@@ -45,7 +45,7 @@ _SHOWN = 40
 
 @dataclass(frozen=True, slots=True)
 class EpisodeRecord:
-    """The record `episode`, parsed.
+    """Contents of the metadata record `episode`.
 
     Attributes:
         task: The task, with the joint names of its messages, `episode_ticks` at 25 Hz.
@@ -96,7 +96,7 @@ class EpisodeRecord:
 
 @dataclass(frozen=True, slots=True)
 class EpisodeOutcome:
-    """The record `episode_result`, parsed. Missing values are None.
+    """Contents of the metadata record `episode_result`; None for missing values.
 
     Attributes:
         received_not_logged: Number of received messages beyond the allowance, by topic.
@@ -143,7 +143,7 @@ class EpisodeOutcome:
 
 
 class HasOutcome:
-    """An episode with its record `episode_result`."""
+    """Base of classes that hold the record `episode_result` of an episode."""
 
     __slots__ = ()
 
@@ -178,7 +178,7 @@ def parse_control_hz(metadata: Strings) -> float:
 
 
 def integer_or_none(metadata: Strings, name: str) -> int | None:
-    """Return a number of the record `episode`, None if it is missing or not allowed."""
+    """Return the integer `name` of the record `episode`; None if missing or out of range."""
     try:
         return _number(metadata, name, int)
     except ValueError:

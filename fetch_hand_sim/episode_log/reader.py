@@ -86,7 +86,7 @@ class EpisodeSummary(HasOutcome):
 
 @dataclass(frozen=True, eq=False)
 class Episode(EpisodeSummary):
-    """An episode file, checked as a whole: attachments by file name, schemas and channels by id."""
+    """A checked episode file: attachments by file name, schemas and channels by id."""
 
     attachments: dict[str, bytes]
     schemas: dict[int, Schema]
@@ -114,7 +114,7 @@ class Episode(EpisodeSummary):
         return len(self._indices(name))
 
     def rows(self, name: str) -> MessageRows:
-        """Return the messages of a topic; raise EpisodeReadError unless they have one size."""
+        """Return the messages of a topic; raise EpisodeReadError if their sizes differ."""
         indices, messages = self._indices(name), self.sorted_messages
         starts, headers = messages.starts[indices], messages.headers[indices]
         sizes = headers['size']
@@ -185,7 +185,7 @@ def one_line_errors(file: Path) -> Iterator[None]:
 
 
 def _why_unfinished(file: Path) -> str:
-    """Return what to do about a file in the hidden directory of an episode; '' for others."""
+    """Return a hint if the file belongs to an unfinished episode, else ''."""
     if files.active_name(file.parent) is None:
         return ''
     with suppress(OSError):
@@ -237,7 +237,11 @@ def require_contract(metadata: dict[str, str], contents: Contents) -> None:
 
 
 def contract_topics(metadata: dict[str, str]) -> dict[str, TopicSpec]:
-    """Return the topics of the task of an episode by name without leading slash, or ValueError."""
+    """Return the topics that the task of an episode has, by name without leading slash.
+
+    Raises:
+        ValueError: If the metadata name no known task.
+    """
     return _known_topics(parse_task(metadata))
 
 
@@ -268,7 +272,7 @@ def _defines(type_name: str, text: bytes) -> bool:
 
 
 def read_summary(path: Path | str) -> EpisodeSummary:
-    """Return the description and the end of an episode, with the checks of `read_episode`."""
+    """Read metadata and result of an episode, with all checks of `read_episode`."""
     episode = read_episode(path)
     return EpisodeSummary(
         **{each.name: getattr(episode, each.name) for each in fields(EpisodeSummary)}
@@ -312,7 +316,11 @@ def logged_topics(episode: Episode) -> dict[str, TopicSpec]:
 
 
 def split_ticks(episode: Episode) -> list[LoggedTick]:
-    """Return the ticks of an episode in order, each from `/clock` on, or raise EpisodeReadError."""
+    """Divide an episode into its ticks, each of which begins with `/clock`.
+
+    Raises:
+        EpisodeReadError: If the messages are not in this order.
+    """
     specs = logged_topics(episode)
     messages = (
         TickMessage(specs[episode.channels[id].topic], log_time, data)

@@ -114,7 +114,7 @@ class Fields:
         return self._data[start : self._position]
 
     def text(self) -> str:
-        """Read a text, which follows its length."""
+        """Read a text, stored as its length and UTF-8 bytes."""
         start = self._position + 4
         self._position = start + int.from_bytes(self._data[start - 4 : start], 'little')
         if self._position > len(self._data):
@@ -161,7 +161,7 @@ class Channel:
 
 @dataclass(frozen=True, slots=True)
 class Chunk:
-    """Where a chunk is, what its header contains, and where its contents are in `unpacked`."""
+    """Place and header of a chunk, and the place of its records in `Messages.unpacked`."""
 
     position: int
     length: int
@@ -224,7 +224,7 @@ class Contents:
         self._channel_starts: dict[int, int] = {}
 
     def take(self, opcode: int, data: bytes, position: int, end: int) -> None:
-        """Take the record that begins at `position` and whose content ends at `end`."""
+        """Parse and keep the record `data[position:end]`."""
         start = position + RECORD.size
         if opcode == _MESSAGE_INDEX:
             self._take_message_index(data[start:end], position)
@@ -244,7 +244,7 @@ class Contents:
             self._take_attachment(data[start:end], position, end - position)
 
     def define(self, opcode: int, content: bytes, offset: int = 0) -> None:
-        """Take a schema or channel, which may be a repetition."""
+        """Parse and keep a schema or channel; it may repeat an earlier one."""
         id = int.from_bytes(content[:2], 'little')
         known = self._definitions.get((opcode, id))
         if known == content:
@@ -329,7 +329,7 @@ class Contents:
         )
 
     def _take_run(self, data: bytes) -> None:
-        """Take records one after the other: schemas, channels and messages."""
+        """Parse and keep a sequence of records: schemas, channels and messages."""
         starts: list[int] = []
         position, end, base = 0, len(data), self._size
         read = RECORD.unpack_from
@@ -389,7 +389,7 @@ class Contents:
 
 
 def _text(text: str) -> bytes:
-    """Return a text as MCAP writes it, after its length."""
+    """Encode a text as MCAP does: its length, then UTF-8."""
     return len(text.encode()).to_bytes(4, 'little') + text.encode()
 
 

@@ -87,7 +87,7 @@ def find_leftovers(directory: Path | str) -> list[Leftover]:
 
 
 def _inspect(path: Path) -> Leftover | None:
-    """Return the leftover in a hidden directory, None if it is in progress or just completed."""
+    """Describe a hidden directory; None if a process still writes it or it is gone."""
     name = files.active_name(path)
     if name is None:
         return None
@@ -107,7 +107,7 @@ def _inspect(path: Path) -> Leftover | None:
 
 
 def _entries(path: Path, name: str) -> list[Path]:
-    """Return the files of a hidden directory; raise OSError for files of other origin."""
+    """Return the files of a hidden directory; OSError if one was not written by this package."""
     if not stat.S_ISDIR(path.lstat().st_mode):
         raise NotADirectoryError(errno.ENOTDIR, 'is no directory', str(path))
     file = files.bag_file(path, name)
@@ -208,7 +208,7 @@ def _remove_empty(leftover: Path) -> None:
 
 @dataclass(slots=True)
 class _Remains:
-    """The readable part of a file.
+    """What can be read of a cut-off file.
 
     Attributes:
         contents: Records up to the first damage.
@@ -252,7 +252,7 @@ def _read(stream: BinaryIO) -> _Remains:
 
 @contextmanager
 def _replaced(file: Path, remains: _Remains, aside: Path) -> Iterator[None]:
-    """Write the file again and put that in its place, locked until the end of the block."""
+    """Replace a cut-off file by a valid one; it stays locked until the block ends."""
     contents = remains.contents
     records = {record.name: record.content for record in contents.metadata}
     if EPISODE not in records:
@@ -280,7 +280,7 @@ def _replaced(file: Path, remains: _Remains, aside: Path) -> Iterator[None]:
 def _write(
     stream: BinaryIO, file: Path, remains: _Remains, records: dict[str, dict[str, str]]
 ) -> str:
-    """Write the file again within the limits of a writer; return its `metadata.yaml`."""
+    """Write the readable records as a valid file; return the text of its `metadata.yaml`."""
     contents, metadata = remains.contents, checked_strings(records[EPISODE])
     messages = contents.messages()
     specs = contract_topics(metadata)

@@ -38,7 +38,7 @@ _NAME = re.compile(r'\.?(?P<task>.+)_(?P<index>\d+)_seed(?P<seed>\d+)(\.active|\
 
 
 class ReceivedAllowance:
-    """Decides which received messages of an episode are logged, and counts the others."""
+    """Limits how many received messages of an episode are logged, and counts the others."""
 
     def __init__(self) -> None:
         self.omitted: Counter[str] = Counter()
@@ -156,7 +156,7 @@ class EpisodeWriter:
         return self._append(topic, data)
 
     def flush(self) -> None:
-        """Hand all messages to the operating system now; the disk may raise EpisodeLogError."""
+        """Write all messages to the operating system; EpisodeLogError if the disk fails."""
         if self._is_open:
             try:
                 self._bag.flush()
@@ -181,7 +181,7 @@ class EpisodeWriter:
         return self.store()
 
     def end(self, result: Mapping[str, str], reason: str | None = None) -> bool:
-        """Do the first half of `finish`: write everything.
+        """Do the first half of `finish`: write the last messages, the result and the summary.
 
         If the process is killed after this, recovery finds the whole episode. Returns whether there
         is a bag to `store`.
@@ -205,7 +205,7 @@ class EpisodeWriter:
         return True
 
     def store(self) -> Path | None:
-        """Do the second half of `finish`: wait for the disk, then show the episode."""
+        """Do the second half of `finish`: flush to the disk, then give the bag its name."""
         if self._description is None:
             return self._completed
         try:

@@ -304,7 +304,7 @@ def _require_goals(episode: Episode) -> None:
 
 
 def _without_orientations(tick: Tick) -> Tick:
-    """Return the tick of a robot of interface version 1: fingertips without orientation."""
+    """Remove the fingertip orientations, which robots of interface version 1 did not publish."""
     poses = tick.readings['fingertip_poses'].reshape(-1, 7).copy()
     poses[:, 3:] = [1.0, 0.0, 0.0, 0.0]
     return dataclasses.replace(tick, readings={**tick.readings, 'fingertip_poses': poses.ravel()})
@@ -339,7 +339,7 @@ def _applied_command(logged: LoggedTick) -> Array | None:
 
 
 class _Received:
-    """The commands, goals and pushes that the robot received, taken as the node takes them."""
+    """Applies the logged commands, goals and pushes as `sim_node` does."""
 
     def __init__(self, runner: EpisodeRunner, episode: Episode, record: EpisodeRecord) -> None:
         self._runner = runner
@@ -363,7 +363,7 @@ class _Received:
         )
 
     def take(self, logged: LoggedTick) -> None:
-        """Take the messages received after a tick."""
+        """Apply the messages received after the tick `logged`."""
         for each in logged.received:
             with suppress(ValueError):
                 message = deserialize(each.topic.type_name, each.data)

@@ -68,7 +68,7 @@ class CommandBuffer:
         return None if self._received_at is None else self._clock() - self._received_at
 
     def start_episode(self, resting_command: ArrayLike) -> None:
-        """Forget the command.
+        """Drop the last command, because an episode starts.
 
         Args:
             resting_command: (action size,): applies until the first command, and is the base of
@@ -111,14 +111,16 @@ class CommandBuffer:
         self._store(command)
 
     def count_rejection(self, reason: str, line: str) -> None:
-        """Count a message that contains no command: a short reason, and a line with the values."""
+        """Count an unusable message, by its short `reason`; `line` describes it in full."""
         self.rejected[reason] += 1
         self.last_rejection = line
 
     def take(self) -> Array:
         """Return the command of the next tick, (action size,), command units, within limits.
 
-        A command that came since the last tick is never too old, however slow the ticks are.
+        Without a command in this episode it is the resting command. After `timeout` seconds without
+        a new one it is the command that holds. A command that came since the last tick always
+        applies, however slow the ticks are.
         """
         is_fresh, self.has_fresh_command = self.has_fresh_command, False
         if self._command is None:

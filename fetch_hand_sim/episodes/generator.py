@@ -100,7 +100,7 @@ class EpisodeGenerator:
         return _Robot(RobotEpisode(self._simulation, episode, first_seed + episode, stamp_ns))
 
     def _run(self, robots: Sequence[_Robot], first_seed: int) -> None:
-        """Run one episode in every robot; further robots of the simulation run idle."""
+        """Run one episode in each of `robots`; the simulation may have more, not logged."""
         simulation, robot_spec = self._simulation, self._simulation.spec.robot
         simulation.reset(seed=first_seed)
         if self._on_start is not None:
@@ -123,12 +123,12 @@ class EpisodeGenerator:
                     self._take(robot, tick)
 
     def _take(self, robot: _Robot, tick: Tick) -> None:
-        """Encode a tick."""
+        """Encode the messages of a tick and append them to the robot's episode."""
         messages = self._encoder.encode(tick, latched=tick.status.phase != 'running')
         robot.messages.append((tick.stamp_ns, messages, None))
 
     def _receive(self, robots: Sequence[_Robot], commands: Array) -> None:
-        """Note the command for each robot after its last tick, as `policy_node` sends it."""
+        """Append to each robot's episode the command message that `policy_node` would send."""
         for robot, command in zip(robots, commands, strict=False):
             if not robot.episode.is_finished:
                 stamp_ns, messages, _ = robot.messages[-1]
@@ -157,7 +157,7 @@ class EpisodeGenerator:
 
 
 def _completed(waiting: deque[Future[LoggedEpisode]]) -> Iterator[LoggedEpisode]:
-    """Wait for the files, in order; an interrupt leaves the others in `waiting`."""
+    """Yield the files in order as they are completed; Ctrl-C leaves the others in `waiting`."""
     while waiting:
         logged = waiting[0].result()
         waiting.popleft()

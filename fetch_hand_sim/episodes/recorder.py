@@ -62,7 +62,7 @@ DIVERGED = 'diverged'
 
 
 class RecordingContext:
-    """Makes metadata and attachments for the episodes of one simulation.
+    """What all episode files of one simulation share: attachments and most metadata.
 
     Every episode contains the MJCF text; `with_compiled_model` adds the compiled model, 3 MB. The
     largest force of a push, `perturb_limit`, is in N.
@@ -216,7 +216,7 @@ class EpisodeRecorder:
             self._put(partial(self._finish, tick, reason))
 
     def _put(self, task: Task) -> None:
-        """Queue a task; a robot that is faster than its disk waits here."""
+        """Queue a task; wait if the queue is full, because the disk is slower than the robot."""
         if self.has_failed:
             return
         began = now = progressed = time.monotonic()
@@ -234,7 +234,7 @@ class EpisodeRecorder:
             self._report_slow(now)
 
     def _oldest(self, now: float) -> float:
-        """Return the time of the oldest message that the operating system does not have."""
+        """Return when the oldest message came that is not yet written to the operating system."""
         since = self._unflushed_since
         if since is not None:
             return since
@@ -279,7 +279,7 @@ class EpisodeRecorder:
             self._unstored.put(None)
 
     def _run_next(self) -> bool:
-        """Run the next task, or flush where that is due; return False at the end."""
+        """Run the next task, or flush if that is due; return False when the recorder is closed."""
         task: Task | None = self._flush
         try:
             entry = self._tasks.get(timeout=self._time_to_flush())
@@ -328,7 +328,7 @@ class EpisodeRecorder:
     # The storing thread
 
     def _store_all(self) -> None:
-        """Bring finished files to the disk until the recorder is closed."""
+        """Flush finished files to the disk (fsync) until the recorder is closed."""
         while (store := self._unstored.get()) is not None:
             store()
 
@@ -383,12 +383,12 @@ def model_sha256(model: mujoco.MjModel) -> str:
 
 
 def former_model_sha256(model: mujoco.MjModel) -> str:
-    """Return the fingerprint of logs up to 1.0, which depends on paths."""
+    """Return the fingerprint that logs up to version 1.0 have; it depends on file paths."""
     return hashlib.sha256(compiled_bytes(model)).hexdigest()
 
 
 def _contents(struct: Any, prefix: str = '') -> Iterator[tuple[str, bytes]]:
-    """Yield names and values of a structure of MuJoCo and of the structures in it."""
+    """Yield name and bytes of each field of a MuJoCo structure, nested ones included."""
     for name in dir(struct):
         if name.startswith('_') or name in _LEFT_OUT:
             continue

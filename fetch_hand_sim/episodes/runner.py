@@ -211,7 +211,7 @@ class EpisodeRunner:
         return self.stamp_ns >= self._first_stamp_ns
 
     def waiting_status(self) -> EpisodeStatus:
-        """Return the status of the first episode before it starts."""
+        """Return the status to publish before the first episode starts."""
         return self._make_episode(self.stamp_ns).status
 
     def resting_command(self) -> Array:
@@ -226,7 +226,7 @@ class EpisodeRunner:
         self._series_seed = seed - self._first_episode
 
     def set_next_disturbances(self, disturbances: Disturbances) -> None:
-        """Disturb the episodes that start from now on in this way."""
+        """Set the disturbances of all episodes that start from now on."""
         self._new_disturbances = disturbances
 
     def end_episode(self) -> None:
@@ -309,7 +309,7 @@ def accept_goal(
 
 
 def _check_stamp(runner: EpisodeRunner, stamp_ns: int) -> None:
-    """Reject goals of another episode or of the future."""
+    """Raise ValueError for the stamp of a goal that is before the episode or in the future."""
     first, last = runner.current.first_stamp_ns, runner.stamp_ns
     if stamp_ns and not first <= stamp_ns <= last:
         raise ValueError(
@@ -319,9 +319,9 @@ def _check_stamp(runner: EpisodeRunner, stamp_ns: int) -> None:
 
 
 def bounded_wrench(wrench: Array, limit: float) -> Array:
-    """Return a wrench (6,), N and N m, that is accepted: the same, or a weaker one on its line.
+    """Scale a wrench (6,), N and N m, down to the limits; one within them is unchanged.
 
-    `limit` is the largest force, N.
+    `limit` is the largest force, N; force and torque keep their directions.
     """
     force, torque = _sizes(wrench)
     share = max(force / limit, torque / (_LEVER * limit))
@@ -352,7 +352,7 @@ def accept_perturbation(
 
 
 def _sizes(wrench: Array) -> tuple[float, float]:
-    """Return the sizes of the force, N, and of the torque, N m."""
+    """Return the magnitudes of the force, N, and of the torque, N m, of a wrench (6,)."""
     # A number too large to be squared is beyond every limit.
     with np.errstate(over='ignore'):
         return float(np.linalg.norm(wrench[:3])), float(np.linalg.norm(wrench[3:]))
