@@ -106,7 +106,13 @@ def _run(options: argparse.Namespace) -> int:
 def _evaluate(
     options: argparse.Namespace, simulation: Simulation, policy: Policy
 ) -> tuple[EpisodeOutcomes, int]:
-    """Return the outcomes and the exit code; after Ctrl-C the outcomes until then."""
+    """Evaluate the policy; return the outcomes and the exit code of the command.
+
+    After Ctrl-C, these are the outcomes of the episodes until then.
+
+    Raises:
+        KeyboardInterrupt: After Ctrl-C, if no batch of episodes has ended yet.
+    """
     finished: list[EpisodeOutcomes] = []
     with progress('episodes', options.episodes) as advance:
 
@@ -125,7 +131,7 @@ def _evaluate(
 
 
 def _to_csv(outcomes: EpisodeOutcomes) -> bytes:
-    """Return a CSV file with a row per episode; flags are 0 or 1."""
+    """Return the contents of a CSV file with one row per episode; flags are 0 or 1."""
     names = EpisodeOutcomes.__slots__
     columns = ((getattr(outcomes, name) * 1).tolist() for name in names)
     return to_csv(names, zip(*columns, strict=True))

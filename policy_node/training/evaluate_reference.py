@@ -51,13 +51,14 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
 def success_in_reference(
     policy: Policy, reference_id: str, ticks: int, seeds: Sequence[int]
 ) -> int:
-    """Return the number of episodes that end in success.
+    """Run one episode per seed in Gymnasium-Robotics; return how many end in success.
 
     Each episode of a hand task gets a new environment, because the reference carries state from one
     episode to the next.
 
     Args:
         reference_id: Environment of Gymnasium-Robotics, for example `FetchPush-v4`.
+        ticks: Steps per episode.
     """
     warnings.filterwarnings('ignore')
     import gymnasium
@@ -118,7 +119,13 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _report_to_add_to(file: Path | None) -> dict[str, Any]:
-    """Return the contents of the JSON file; it is read before the long evaluation."""
+    """Return the contents of the JSON file; empty if `file` is None or does not exist.
+
+    This is called before the long evaluation, so that an unusable file is found early.
+
+    Raises:
+        UsageError: If the file cannot be written or contains no JSON object.
+    """
     if file is None:
         return {}
     require_writable(file)

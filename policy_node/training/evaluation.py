@@ -34,16 +34,20 @@ class EpisodeOutcomes:
     """Outcomes of evaluated episodes, arrays (episodes,).
 
     Attributes:
+        seed: Seed of the episode.
         success_gymnasium: Success at the last step, rule of the released code.
         success_paper: Success at the last step, rule of the paper's text.
         touched: Success (rule of the simulation) at any step.
+        episode_return: Sum of the rewards.
         diverged: The simulation diverged; the episode counts as a failure.
-        ticks_reached: Ticks in success (rule of the simulation) that another tick follows.
-        long_way: The quaternions of goal and object had opposite signs at the start, so that the
-            `gymnasium` rule asks for the turn of more than pi; False where the goal is no pose.
-        dropped: The object was below the palm at the end; False where the goal is no pose.
-        final_distance: Metres to the goal at the end; NaN where position does not count.
-        final_rotation: Radians to the goal at the end; NaN where rotation does not count.
+        ticks_reached: Number of ticks in success (rule of the simulation), without the last tick.
+        ticks_kept: Number of these ticks after which the next tick is in success too.
+        long_way: At the start, the quaternions of goal and object had opposite signs. The
+            `gymnasium` rule then requires the rotation by more than pi. False if the goal is no
+            pose.
+        dropped: The object was below the palm at the end; False if the goal is no pose.
+        final_distance: Metres to the goal at the end; NaN if position does not count.
+        final_rotation: Radians to the goal at the end; NaN if rotation does not count.
     """
 
     seed: NDArray[np.int64]
@@ -63,18 +67,22 @@ class EpisodeOutcomes:
         return len(self.seed)
 
     def join(self, other: EpisodeOutcomes) -> EpisodeOutcomes:
-        """Both, one after the other."""
+        """Return the episodes of both, those of `other` last."""
         names = EpisodeOutcomes.__slots__
         pairs = [(getattr(self, name), getattr(other, name)) for name in names]
         return EpisodeOutcomes(*(np.concatenate(pair) for pair in pairs))
 
     def first(self, count: int) -> EpisodeOutcomes:
-        """The first `count` episodes."""
+        """Return the first `count` episodes."""
         return EpisodeOutcomes(*(getattr(self, n)[:count] for n in EpisodeOutcomes.__slots__))
 
 
 def wilson_interval(successes: int, episodes: int) -> tuple[float, float]:
-    """95 % interval of a success probability (Wilson 1927)."""
+    """Return the 95 % interval of a success probability (Wilson 1927).
+
+    Raises:
+        ValueError: If `episodes` is less than 1.
+    """
     if episodes < 1:
         raise ValueError(f'{episodes} episodes; allowed: 1 or more')
     rate, square = successes / episodes, _Z95**2
@@ -85,7 +93,7 @@ def wilson_interval(successes: int, episodes: int) -> tuple[float, float]:
 
 
 def summarize(outcomes: EpisodeOutcomes) -> dict[str, Any]:
-    """Rates and mean return of an evaluation, ready for JSON."""
+    """Return success rates with 95 % intervals, mean return and `diagnose`, ready for JSON."""
     episodes = len(outcomes)
     summary: dict[str, Any] = {'episodes': episodes, 'first_seed': int(outcomes.seed[0])}
     for name in ('success_gymnasium', 'success_paper', 'touched'):
@@ -98,13 +106,14 @@ def summarize(outcomes: EpisodeOutcomes) -> dict[str, Any]:
 
 
 def diagnose(outcomes: EpisodeOutcomes) -> dict[str, float]:
-    """Why episodes fail; what the task does not have, or did not happen, is left out.
+    """Return measures that show why episodes fail, by name.
 
     Returns:
         `stay`: probability of success at the next tick, given success at this one. `long_way`:
-        success at the last step of episodes that ask for the turn of more than pi, and
-        `long_way_share`, how many do. `dropped`: share of episodes that end below the palm.
-        `distance`, `rotation`: medians at the end, metres and radians.
+        success rate of the episodes that require a rotation by more than pi; `long_way_share`:
+        share of these episodes. `dropped`: share of episodes that end with the object below the
+        palm. `distance`, `rotation`: medians at the end, metres and radians. Measures that do not
+        apply to the task or to any episode are missing.
     """
     found: dict[str, float] = {}
     if outcomes.ticks_reached.any():
@@ -121,7 +130,7 @@ def diagnose(outcomes: EpisodeOutcomes) -> dict[str, float]:
 
 
 def run_episodes(simulation: Simulation, policy: Policy, seeds: list[int]) -> EpisodeOutcomes:
-    """Runs one episode per simulation, without noise.
+    """Run one episode in each simulation, without noise, and return the outcomes.
 
     Args:
         simulation: The simulations; both success rules are applied.
@@ -166,7 +175,7 @@ def run_episodes(simulation: Simulation, policy: Policy, seeds: list[int]) -> Ep
 
 
 def _long_way(spec: TaskSpec, observation: dict[str, NDArray[np.float64]]) -> NDArray[np.bool_]:
-    """Return where goal and object have quaternions of opposite signs, (episodes,)."""
+    """Return (episodes,): True if goal and object have quaternions of opposite signs."""
     achieved, desired = observation['achieved_goal'], observation['desired_goal']
     if spec.goal is not GoalKind.POSE:
         return np.zeros(len(achieved), np.bool_)
@@ -180,11 +189,15 @@ def evaluate(
     first_seed: int,
     hopeless: Callable[[EpisodeOutcomes], bool] | None = None,
 ) -> EpisodeOutcomes:
-    """Evaluates a policy on episodes with seeds `first_seed`, `first_seed` + 1, ...
+    """Evaluate a policy on episodes with the seeds `first_seed`, `first_seed` + 1, ...
 
     Args:
         simulation: The simulations; the result does not depend on their number.
-        hopeless: Asked after each batch; True ends the evaluation early.
+        episodes: Number of episodes; without an early end, as many outcomes are returned.
+        hopeless: Called after each batch with all outcomes so far; True ends the evaluation early.
+
+    Raises:
+        ValueError: If `episodes` is less than 1.
     """
     outcomes: EpisodeOutcomes | None = None
     done = 0
@@ -205,14 +218,14 @@ EVALUATION_SEED = 1_000_000_000
 
 
 def training_seeds(sequence: np.random.SeedSequence, count: int) -> list[int]:
-    """Return seeds of `count` training episodes; evaluation never uses them."""
+    """Return `count` seeds for training episodes from `sequence`; evaluations use other seeds."""
     return [int(seed) % EVALUATION_SEED for seed in sequence.generate_state(count) >> 2]
 
 
 class Evaluator:
-    """Evaluates on the same episodes each time, in simulations of its own.
+    """Evaluates the policies of a run, always on the same episodes, in separate simulations.
 
-    Training episodes therefore do not depend on whether there was an evaluation between them.
+    So evaluations do not change the training episodes.
     """
 
     def __init__(self, simulation: Simulation, config: TrainConfig) -> None:
@@ -220,9 +233,9 @@ class Evaluator:
         self._config = config
 
     def evaluate(self, actor: Actor, best_success: float) -> EpisodeOutcomes:
-        """Runs the episodes, fewer once their success cannot reach `best_success` any more.
+        """Evaluate an actor; end early if its success rate cannot reach `best_success`.
 
-        "Cannot" means that it lies above the 95 % interval of the episodes so far.
+        This is assumed once `best_success` lies above the 95 % interval of the episodes so far.
         """
         rule = self._config.success_rule
 
@@ -234,20 +247,20 @@ class Evaluator:
         return evaluate(self._simulation, actor, episodes, EVALUATION_SEED, hopeless)
 
     def success_of(self, policy: Policy) -> float:
-        """Return the success rate of a policy in all episodes."""
+        """Return the success rate of a policy over all evaluation episodes."""
         episodes = self._config.evaluation_episodes
         outcomes = evaluate(self._simulation, policy, episodes, EVALUATION_SEED)
         return success_rate(outcomes, self._config.success_rule)
 
 
 def successes(outcomes: EpisodeOutcomes, success_rule: str) -> NDArray[np.bool_]:
-    """Success of each episode at the last step, by a rule."""
+    """Return which episodes succeed at the last step, by the rule `gymnasium` or `paper`."""
     paper = success_rule == 'paper'
     return outcomes.success_paper if paper else outcomes.success_gymnasium
 
 
 def success_rate(outcomes: EpisodeOutcomes, success_rule: str) -> float:
-    """Share of episodes that succeed at the last step, by a rule."""
+    """Return the share of episodes that succeed at the last step, by `gymnasium` or `paper`."""
     return float(successes(outcomes, success_rule).mean())
 
 
@@ -263,7 +276,11 @@ _NARROWEST = 60
 
 
 def print_table(report: dict[str, Any]) -> None:
-    """Prints rates with their 95 % intervals."""
+    """Print the summary of an evaluation as a table, with 95 % intervals.
+
+    `report` is the result of `summarize` with the keys `task` and `policy`, and maybe
+    `disturbances`.
+    """
     title = f'{report["task"]}: {report["policy"]}, {report["episodes"]} episodes'
     if 'disturbances' in report:
         title += ', disturbed'

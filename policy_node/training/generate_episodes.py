@@ -1,7 +1,7 @@
 """Log episodes of a policy in the batched simulation, without ROS.
 
-The files are byte-compatible with those of `sim_node`. The same command line gives the same
-messages.
+The files are byte-compatible with those of `sim_node`. The same command line logs the same
+messages again.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
 
 
 def make_generator(options: argparse.Namespace) -> tuple[EpisodeGenerator, Simulation]:
-    """Return the generator of episodes and its simulation.
+    """Return a generator that runs the chosen policy and logs its episodes, and its simulation.
 
     Raises:
         UsageError: If the policy cannot be loaded, or an option does not fit it.
@@ -122,7 +122,10 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _warn_of_repeated_seeds(options: argparse.Namespace, task: str) -> None:
-    """Warn of episodes that the folder already contains; training would see them twice."""
+    """Warn if the output folder already contains episodes with the seeds to generate.
+
+    Training would use such episodes twice.
+    """
     try:
         seeds = named_seeds(options.output, task)
     except OSError:

@@ -1,4 +1,4 @@
-"""The machine of a run: device, processor, memory, threads, other workers under `torchrun`."""
+"""The hardware of a run: device, processor, memory and threads; other workers of `torchrun`."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def available_memory() -> int | None:
 
 
 def processor() -> str:
-    """Return the model of the processor, or its architecture where Linux names no model."""
+    """Return the name of the processor, or its architecture if Linux reports no name."""
     info = Path('/proc/cpuinfo')
     lines = info.read_text().splitlines() if info.is_file() else []
     models = [line.split(':')[1].strip() for line in lines if line.startswith('model name')]
@@ -41,10 +41,11 @@ def processor() -> str:
 
 
 def split_threads(config: TrainConfig) -> tuple[int, int]:
-    """Return the numbers of simulation threads and of tensor threads of this worker.
+    """Return the number of simulation threads and the number of tensor threads of this worker.
 
-    Open numbers (0) share the worker's cores, because collecting and learning may overlap. A second
-    tensor thread gains 5 % at 3 x 256 and batch 1024, 80 % at 4096 (measured on 4 cores).
+    Numbers that are 0 in the configuration share the worker's cores, because collecting and
+    learning may overlap. A second tensor thread gains 5 % at 3 x 256 and batch 1024, 80 % at 4096
+    (measured on 4 cores).
     """
     local_workers = int(os.environ.get('LOCAL_WORLD_SIZE', '1'))
     cores = max(len(os.sched_getaffinity(0)) // local_workers, 1)
@@ -55,7 +56,7 @@ def split_threads(config: TrainConfig) -> tuple[int, int]:
 
 
 def uses_bfloat16(precision: str, device: torch.device) -> bool:
-    """Return whether matrix products run in bfloat16; with `auto` if the device supports it."""
+    """Return whether matrix products use bfloat16; for `auto`, whether the device supports it."""
     if precision != 'auto':
         return precision == 'bfloat16'
     if device.type == 'cuda':
@@ -64,7 +65,9 @@ def uses_bfloat16(precision: str, device: torch.device) -> bool:
 
 
 def choose_device(name: str) -> torch.device:
-    """Return the device `cpu` or `cuda`; `auto` is a GPU if torch has one.
+    """Return the torch device for `cpu`, `cuda` or `auto`, a GPU if torch has one.
+
+    With `torchrun`, each worker of a machine gets its own GPU.
 
     Raises:
         ValueError: If `name` is `cuda` and torch has no GPU.
@@ -78,12 +81,12 @@ def choose_device(name: str) -> torch.device:
 
 @dataclass(frozen=True, slots=True)
 class Workers:
-    """This worker's place among all.
+    """This worker and its connection to the other workers, the processes that train together.
 
     Attributes:
         rank: Index of this worker; worker 0 writes logs and checkpoints.
         world_size: Number of workers.
-        device: Device of messages: the GPU with nccl, else the CPU.
+        device: Device on which messages are sent: the GPU with nccl, else the CPU.
     """
 
     rank: int = 0
@@ -100,7 +103,10 @@ class Workers:
         return -(-total // self.world_size)
 
     def sum(self, values: Tensor) -> Tensor:
-        """Return the sum of `values` over all workers, on the device of `values`."""
+        """Return the sum of `values` over all workers, on the device of `values`.
+
+        All workers must call this together.
+        """
         if self.world_size == 1:
             return values
         message = values.to(self.device, copy=True)
@@ -108,7 +114,10 @@ class Workers:
         return message.to(values.device)
 
     def average_gradients(self, gradients: Sequence[Tensor]) -> None:
-        """Replace each gradient by its mean over all workers, in one message."""
+        """Replace each gradient, in place, by its mean over all workers.
+
+        All workers must call this together.
+        """
         if self.world_size == 1:
             return
         flat = torch.cat([gradient.reshape(-1) for gradient in gradients])
@@ -118,7 +127,10 @@ class Workers:
             gradient.copy_(part.view_as(gradient))
 
     def broadcast(self, tensors: Sequence[Tensor]) -> None:
-        """Copy the values of worker 0 to every worker."""
+        """Overwrite `tensors` of every worker with those of worker 0.
+
+        All workers must call this together.
+        """
         if self.world_size == 1:
             return
         for tensor in tensors:
@@ -127,17 +139,20 @@ class Workers:
             tensor.detach().copy_(message)
 
     def any(self, flag: bool) -> bool:
-        """Return whether the flag is set on any worker; all must call this together."""
+        """Return whether `flag` is True on any worker. All must call this together."""
         return bool(self.sum(torch.tensor([float(flag)])).item() > 0)
 
 
 def is_first_worker() -> bool:
-    """Return whether this process will be worker 0, before the workers have joined."""
+    """Return whether this process is worker 0; for use before `join_workers`."""
     return os.environ.get('RANK', '0') == '0'
 
 
 def join_workers(device: torch.device) -> Workers:
-    """Join the workers that `torchrun` started, or return a single worker."""
+    """Connect to the other workers that `torchrun` started; return this worker.
+
+    Without `torchrun` there is a single worker.
+    """
     world_size = int(os.environ.get('WORLD_SIZE', '1'))
     if world_size == 1:
         return Workers()
@@ -149,6 +164,6 @@ def join_workers(device: torch.device) -> Workers:
 
 
 def leave_workers(workers: Workers) -> None:
-    """Close the connection to the other workers."""
+    """Close the connection to the other workers, if there are any."""
     if workers.world_size > 1:
         distributed.destroy_process_group()

@@ -1,4 +1,4 @@
-"""The options of commands that run a policy, and the policy and simulation they choose."""
+"""Options that commands share to choose a policy and simulations, and functions to apply them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from policy_node.policies.policy import LoadedPolicy, PolicyError
 
 
 def add_policy_options(parser: argparse.ArgumentParser) -> None:
-    """Add `--policy`, `--task` and `--trust`."""
+    """Add the options `--policy`, `--task` and `--trust`, for `load_chosen_policy`."""
     add = parser.add_argument
     add('--policy', default='', help=POLICY_NAMES)
     add('--task', choices=list(TASKS), metavar='TASK', help='default: the task of the policy')
@@ -29,7 +29,7 @@ def add_policy_options(parser: argparse.ArgumentParser) -> None:
 
 
 def add_batch_options(parser: argparse.ArgumentParser, num_envs: int, episodes: int = 1000) -> None:
-    """Add `--episodes` and `--num-envs`, with these defaults, and `--threads`."""
+    """Add `--episodes` and `--num-envs` with these defaults, and `--threads`."""
     add, count = parser.add_argument, whole_number(1)
     add('--episodes', type=count, default=episodes, help=f'default: {episodes}')
     simulations = f'simulations in the batch; default: {num_envs}'
@@ -38,24 +38,24 @@ def add_batch_options(parser: argparse.ArgumentParser, num_envs: int, episodes: 
 
 
 def add_disturbances_option(parser: argparse.ArgumentParser) -> None:
-    """Add `--disturbances`."""
+    """Add the option `--disturbances`."""
     presets = 'none, mild, hardware, severe, scaled as in hardware*0.5, or a YAML file'
     help_text = f'of the robot: {presets}; default: none'
     parser.add_argument('--disturbances', default='none', help=help_text)
 
 
 def add_reward_options(parser: argparse.ArgumentParser) -> None:
-    """Add `--success-rule` and `--reward-type`."""
+    """Add the options `--success-rule` and `--reward-type`."""
     add = parser.add_argument
     add('--success-rule', choices=SUCCESS_RULES, default='gymnasium', help='of the reward')
     add('--reward-type', choices=REWARD_TYPES, default='sparse', help='of the return')
 
 
 def load_chosen_policy(options: argparse.Namespace) -> LoadedPolicy:
-    """Load the policy of the options of `add_policy_options`.
+    """Load the policy that the options of `add_policy_options` choose.
 
     Raises:
-        UsageError: If the policy cannot be loaded.
+        UsageError: If `--policy` and `--task` are missing, or the policy cannot be loaded.
     """
     if not options.policy and options.task is None:
         raise UsageError(f'--policy is missing; allowed: {POLICY_NAMES}')
@@ -67,7 +67,7 @@ def load_chosen_policy(options: argparse.Namespace) -> LoadedPolicy:
 
 @contextmanager
 def policy_errors() -> Iterator[None]:
-    """End the command with one line if the policy fails."""
+    """Turn a `PolicyError` in the block into a `CommandError`: one line ends the command."""
     try:
         yield
     except PolicyError as error:
@@ -75,7 +75,7 @@ def policy_errors() -> Iterator[None]:
 
 
 def make_chosen_simulation(options: argparse.Namespace, loaded: LoadedPolicy) -> Simulation:
-    """Return simulations for a policy, with the batch, reward and disturbances options.
+    """Return the simulations for a policy that the batch, reward and disturbances options choose.
 
     Raises:
         UsageError: If an option does not fit the policy.
@@ -95,10 +95,12 @@ def make_chosen_simulation(options: argparse.Namespace, loaded: LoadedPolicy) ->
 
 
 def require_writable(file: Path) -> None:
-    """Create the folder of a file before long work, and check that the file can be written.
+    """Create the folder of `file` and check that the file can be written.
+
+    Commands call this before long work.
 
     Raises:
-        UsageError: If it cannot.
+        UsageError: If the file cannot be written.
     """
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -111,10 +113,10 @@ def require_writable(file: Path) -> None:
 
 
 def write_result(file: Path, data: bytes) -> None:
-    """Write a file of a command.
+    """Write the result of a command to a file.
 
     Raises:
-        CommandError: If it cannot be written.
+        CommandError: If the file cannot be written.
     """
     try:
         write_file(file, data)

@@ -1,4 +1,4 @@
-"""The function `train`: `fetch_hand_sim train` for Python."""
+"""The function `train`, which does in Python what `fetch_hand_sim train` does."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ class Run:
 
     Attributes:
         folder: Folder of the run.
-        config: Configuration.
-        reason: Reason of its end, in words.
+        config: Configuration of the run.
+        reason: Why the run ended, in words.
         env_steps: Environment steps of all parts of the run.
         seconds: Wall-clock time of all parts of the run.
         best_success: Success at the last step in the best evaluation; -1.0 without an evaluation.
@@ -48,7 +48,7 @@ class Run:
 
     @property
     def actor(self) -> Path:
-        """File of the best actor, or of the latest one without an evaluation."""
+        """File of the best actor; of the latest actor if there was no evaluation."""
         best = self.folder / BEST_FILE
         return best if best.is_file() else self.folder / LATEST_FILE
 
@@ -127,7 +127,7 @@ def train(
 
 @contextlib.contextmanager
 def _torch_restored() -> Iterator[None]:
-    """Restore torch's threads and random numbers of the calling program."""
+    """Restore torch's number of threads and random state of the calling program afterwards."""
     threads = torch.get_num_threads()
     try:
         with torch.random.fork_rng():

@@ -59,7 +59,9 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
 
 
 def config_from_arguments(options: argparse.Namespace) -> TrainConfig:
-    """Return the configuration: recipe or resumed run, then options, then `--set`.
+    """Return the configuration that the options choose.
+
+    It is the recipe or the resumed run, changed by the options and by `--set`.
 
     Raises:
         ValueError: If a value is missing, unknown or not allowed.
@@ -76,7 +78,11 @@ def config_from_arguments(options: argparse.Namespace) -> TrainConfig:
 
 
 def _configured(options: argparse.Namespace, overrides: dict[str, Any]) -> TrainConfig:
-    """Return the configuration of the recipe or the resumed run, with fields replaced."""
+    """Return the configuration of the recipe or the resumed run, changed by `overrides`.
+
+    Raises:
+        ValueError: If `--task` is missing, options exclude each other or a value is not allowed.
+    """
     task, recipe = (overrides.pop(name, None) for name in _OWN_OPTIONS)
     if options.resume is not None:
         if options.output is not None:
@@ -125,10 +131,11 @@ def _run(options: argparse.Namespace, command: str) -> int:
 
 
 def _read_experience(config: TrainConfig, directory: Path | None) -> Episodes | None:
-    """Load logged episodes and report rejected ones; return None without a directory.
+    """Load the logged episodes in `directory` and report skipped ones; None without a directory.
 
     Raises:
-        ValueError: If no episode is usable, or the replay is too small.
+        ValueError: If a field excludes logged episodes, no episode is usable, or the replay is too
+            small.
     """
     if directory is None:
         return None

@@ -31,11 +31,13 @@ _OTHER_VALUES = ('algorithm', 'longest_hold', 'advantage', 'subgoal_every', 'con
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """Means over the episodes from one tick on; the correlation is NaN if one is constant.
+    """The critic's values and the returns at one tick, as means over episodes.
 
     Attributes:
+        tick: Tick of the episodes at which both are taken.
         value: Value of the actor's action.
-        episode_return: Discounted training rewards.
+        episode_return: Discounted training rewards from this tick on.
+        correlation: Correlation of both over episodes; NaN if one of them is constant.
     """
 
     tick: int
@@ -45,10 +47,13 @@ class Comparison:
 
 
 def measure(run: Path, episodes: int) -> list[Comparison]:
-    """Compare values with returns in new episodes of the collecting actor of a run.
+    """Compare the critic's values with returns in new episodes of a run's actor, without noise.
+
+    `run` is the folder. The actor is the one that collects, not its average. There is one
+    comparison for each of a few ticks of the episodes.
 
     Raises:
-        ValueError: If the folder contains no run, or its values are not those of actions.
+        ValueError: If the folder contains no run, or its critic returns no action values.
     """
     state = read_state(run / STATE_FILE)
     config = config_from_dict(state.extra['config'])
@@ -70,7 +75,7 @@ def measure(run: Path, episodes: int) -> list[Comparison]:
 def _play(
     simulation: Simulation, learner: ActorCritic, compute_reward: RewardFunction
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return values and rewards (ticks, episodes) of one episode in each simulation."""
+    """Run an episode in each simulation; return values and rewards, each (ticks, episodes)."""
     count = simulation.num_envs
     observation = simulation.reset(seed=[FIRST_SEED + index for index in range(count)])
     values, rewards = [], []
@@ -87,7 +92,10 @@ def _play(
 def _judge(
     learner: ActorCritic, observation: NDArray[np.float64], goal: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return values (episodes,) and actions (episodes, action size) of the actor."""
+    """Return the critic's values (episodes,) of the actor's actions, and these actions.
+
+    Actions are (episodes, action size), without noise.
+    """
     seen, wanted = (learner.tensor(values).float() for values in (observation, goal))
     features = learner.actor.features(seen, wanted)
     action = learner.actor(features)
@@ -98,7 +106,10 @@ def _judge(
 
 
 def discounted(rewards: NDArray[np.float64], gamma: float) -> NDArray[np.float64]:
-    """Return returns (ticks, episodes); after the end, rewards stay the mean of the last ticks."""
+    """Return the discounted returns (ticks, episodes) from each tick on.
+
+    After the end of an episode, each reward is taken as the mean of its last ticks.
+    """
     following = rewards[-_LAST_TICKS:].mean(axis=0) / (1.0 - gamma)
     returns = np.empty_like(rewards)
     for tick in reversed(range(len(rewards))):

@@ -18,7 +18,7 @@ Observations = Mapping[str, ArrayLike]
 
 
 class ActionNoise:
-    """Exploration noise: Gaussian, or a uniformly random action in place of the policy's.
+    """Adds exploration noise to actions: Gaussian, or a uniformly random action instead.
 
     Args:
         shape: (simulations, action size).
@@ -49,8 +49,7 @@ class ActionNoise:
     def around(self, action: NDArray[Any], tick: int) -> Array32:
         """Return `action` (simulations, action size) with exploration noise, clipped to [-1, 1].
 
-        `tick` counts from the start of the episode, so that all episodes draw noise at the same
-        ticks.
+        `tick` is the tick of the episode; tick 0 draws new noise.
         """
         share = self.share
         if tick % self._ticks == 0:

@@ -120,7 +120,7 @@ class Experience:
         """Add new episodes to the statistics and set the normalizers of `actor` from them.
 
         The goals are relabelled first, because the networks learn from relabelled goals. All
-        workers must call this together, also without episodes.
+        workers must call this together, even with no episodes.
         """
         observation, goal = episodes.observation[:, :-1], episodes.desired_goal
         if len(episodes):
@@ -167,10 +167,10 @@ class Experience:
 def ticks_until_dropped(
     spec: TaskSpec, more: int
 ) -> Callable[[Episodes], NDArray[np.int64]] | None:
-    """Return a function that counts the ticks of each episode to learn from, (episodes,).
+    """Return a function that counts how many ticks of each episode to learn from, (episodes,).
 
-    These end `more` ticks after the object dropped, which means that its centre is below the palm.
-    Return None, for all ticks, if the task has no object in a hand or `more` is negative.
+    An episode counts until `more` ticks after the object dropped: its centre is below the palm.
+    Return None, which means all ticks, if the task has no object in a hand or `more` is negative.
     """
     if spec.goal is not GoalKind.POSE or more < 0:
         return None

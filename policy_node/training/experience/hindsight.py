@@ -51,7 +51,7 @@ def draw_sources(
 ) -> NDArray[np.intp]:
     """Draw a goal source for each of `count` transitions.
 
-    Return indices (count,) into the names of `mixture`, which contains their probabilities.
+    `mixture` maps each source to its probability. The result, (count,), contains positions in it.
     """
     bounds = np.cumsum(list(mixture.values()))
     return np.searchsorted(bounds / bounds[-1], generator.random(count), side='right')
@@ -150,7 +150,7 @@ def displace(here: Array32, before: Array32, after: Array32) -> Array32:
 
 
 def _achieved(starts: Starts, state: NDArray[np.int64]) -> Array32:
-    """Return the goals (batch, goal_size) achieved at the ticks `state`, (batch,)."""
+    """Return the goals (batch, goal_size) achieved at the ticks `state` of these episodes."""
     achieved = flat(starts.episodes.achieved_goal)
     return achieved.take(starts.row * (starts.episodes.ticks + 1) + state, axis=0)
 

@@ -22,8 +22,8 @@ class GradedReward:
     It is the share of distance thresholds met, times the share of rotation thresholds met if the
     goal has a rotation, minus 1. The sparse reward does not show how nearly a goal was missed or
     how safely it was met. With the sparse reward, an actor holds an object no better than the
-    threshold needs. If goals have a position and a rotation, it forgets one of them as long as it
-    never meets both.
+    threshold needs. If goals have a position and a rotation, the actor forgets one of them as long
+    as it never meets both.
 
     Attributes:
         metric: Distance and rotation to the goal, and the success thresholds.

@@ -184,10 +184,10 @@ def sampler_fields(config: TrainConfig, metric: GoalMetric) -> dict[str, Any]:
 def _with_losses(
     starts: Starts, steps: NDArray[np.int64], batch: Transitions, value: float
 ) -> Transitions:
-    """Return the batch with no bootstrap where an episode was cut after a drop.
+    """Return the batch without bootstrapping where an episode was cut after a drop.
 
-    Transitions into the last valid state of such an episode get `value` as the next value, as part
-    of their reward, and a discount of 0.
+    If a transition leads to the last valid state of such an episode, the discounted `value` is
+    added to its reward, and its discount becomes 0.
     """
     lost = (starts.tick + steps == starts.last) & (starts.last < starts.episodes.ticks)
     reward = batch.reward + lost * batch.discount * np.float32(value)

@@ -1,1 +1,1 @@
-"""The learners and their networks: DDPG and its variants, PPO."""
+"""The base class of learners, DDPG, and DDPG with imagined subgoals; more are in `research`."""
