@@ -8,9 +8,6 @@ import shutil
 from pathlib import Path
 
 import pytest
-from rcl_interfaces.msg import Parameter, ParameterValue
-from rcl_interfaces.srv import SetParameters
-from std_msgs.msg import Float64MultiArray
 
 from fetch_hand_sim.commands.episodes_list import main as list_episodes
 from fetch_hand_sim.episode_log import Episode
@@ -65,9 +62,10 @@ def answer_after(robot: Client, seconds: float, steps: int, *, is_stamped: bool 
         first = first or robot.received_at['joint_states'][-1]
         robot.spin(seconds)
         stamp = message_stamp(states[count])
-        stamped = codec.encode(stamp, [0.1, 0.0, 0.0, 0.0])
-        plain = Float64MultiArray(data=[0.1, 0.0, 0.0, 0.0])
-        robot.publish('commands', stamped if is_stamped else plain)
+        if is_stamped:
+            robot.publish('commands', codec.encode(stamp, [0.1, 0.0, 0.0, 0.0]))
+        else:
+            robot.command(0.1, 0.0, 0.0, 0.0)
     return robot.received_at['joint_states'][-1] - first
 
 
@@ -107,8 +105,7 @@ def test_a_slow_policy_slows_the_robot_that_waits_for_it(start_process: Start) -
     with client(REACH) as robot:
         robot.subscribe('joint_states', '/diagnostics')
         robot.connect('commands')
-        wait = Parameter(name='answer_wait', value=ParameterValue(type=3, double_value=400.0))
-        assert robot.call(SetParameters, 'sim_node/set_parameters', parameters=[wait])
+        assert robot.set_parameter('sim_node', 'answer_wait', 400.0).successful
         seconds = answer_after(robot, 0.08, 40)
         stamps = robot.stamps('joint_states')
         assert stamps == sorted(stamps)
@@ -131,6 +128,8 @@ def test_with_answer_wait_real_time_equals_lockstep(start_process: Start, tmp_pa
         code, output = finish(start_process(*SIM_NODE, *arguments), timeout=120.0)
         assert code == 0, output
         episodes = episodes_in(tmp_path / name)
+        assert [each.result['success'] for each in episodes] == ['true', 'true']
+        assert all(len(each.metadata['checkpoint_sha256']) == 64 for each in episodes)
         # The answer to the last tick of an episode may come in the next one, where it is late.
         messages = [payload(each) for each in episodes]
         for each in messages:

@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import signal
-import time
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from rcl_interfaces.msg import Parameter, ParameterValue
-from rcl_interfaces.srv import SetParameters
-from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import SetBool, Trigger
 
 from fetch_hand_sim.episode_log import find_leftovers
+from fetch_hand_sim.episodes.runner import EpisodeRunner
 from fetch_hand_sim.simulation import Simulation
 from msgs_spec.codecs import build_message, decode, message_stamp
 from msgs_spec.observations import ObservationAssembler
@@ -23,10 +19,10 @@ from msgs_spec.schemas import deserialize, serialize
 from msgs_spec.tasks import task_spec
 from msgs_spec.topics import topic, topics
 from node_runtime.ros import rclpy_profile
+from support import wait_until
 from support.graph import (
-    POLICY_NODE,
     SIM_NODE,
-    TIMEOUT,
+    Client,
     Start,
     client,
     episodes_in,
@@ -38,29 +34,11 @@ from support.tasks import each_task
 REACH = task_spec('FetchReach')
 
 
-def send(robot: Any, *values: float) -> None:
-    robot.publish('commands', Float64MultiArray(data=[float(value) for value in values]))
-
-
-def test_actor_in_another_process_reaches_its_goals(start_process: Start, tmp_path: Path) -> None:
-    policy = start_process(*POLICY_NODE)
-    sim = start_process(
-        *SIM_NODE,
-        *ros_args(episodes=2, real_time_factor=4.0, wait_for_commands=True, episode_dir=tmp_path),
-    )
-    code, output = finish(sim)
-    assert code == 0, output
-    policy.send_signal(signal.SIGTERM)
-    assert finish(policy)[0] == 0
-    logged = episodes_in(tmp_path)
-    assert [episode.result['success'] for episode in logged] == ['true', 'true']
-    assert all(len(episode.topics['/commands'].messages) > 25 for episode in logged)
-    assert all(len(e.metadata['checkpoint_sha256']) == 64 for e in logged)
-
-
-def test_every_topic_has_the_promised_type_and_quality(start_process: Start) -> None:
-    start_process(*SIM_NODE, *ros_args(task='HandManipulateBlockFull'))
+def test_topics_have_the_promised_type_and_quality_and_commands_by_name_move_these_joints(
+    start_process: Start,
+) -> None:
     spec = task_spec('HandManipulateBlockFull')
+    start_process(*SIM_NODE, *ros_args(task=spec.name, mode='lockstep', wait_for_commands=True))
     with client(spec) as robot:
         for promised in topics(spec):
             look = (
@@ -72,10 +50,22 @@ def test_every_topic_has_the_promised_type_and_quality(start_process: Start) -> 
             (info,) = look(promised.name)
             offered, wanted = info.qos_profile, rclpy_profile(promised.qos)
             assert info.topic_type == promised.type_name
-            assert (offered.reliability, offered.durability) == (
-                wanted.reliability,
-                wanted.durability,
-            )
+            assert offered.reliability == wanted.reliability
+            assert offered.durability == wanted.durability
+        robot.subscribe('applied_command', 'joint_states')
+        robot.connect('joint_commands')
+        robot.spin_until(lambda: bool(robot.received['joint_states']), 'the reset')
+        message = robot.publisher('joint_commands').msg_type()
+        message.name = ['robot0:THJ0', 'robot0:WRJ1']
+        message.position = [-0.5, 0.1]
+        robot.publish('joint_commands', message)
+        robot.spin_until(lambda: bool(robot.received['applied_command']), 'a tick')
+        applied = decode(topic(spec, 'applied_command'), robot.received['applied_command'][0])
+    runner = EpisodeRunner(Simulation(spec.name))
+    runner.advance(runner.resting_command())
+    expected = runner.resting_command()
+    expected[[0, -1]] = 0.1, -0.5
+    np.testing.assert_allclose(applied, expected, atol=1e-12)
 
 
 @each_task
@@ -131,7 +121,7 @@ def test_topics_rebuild_the_observation_bit_for_bit(
             for key, values in assembler.assemble(vectors).items():
                 assert values.tobytes() == expected[tick][key][0].tobytes(), (tick, key)
             if tick < ticks:
-                send(robot, *command_from_action(spec.robot, actions[tick]))
+                robot.command(*command_from_action(spec.robot, actions[tick]))
 
 
 def test_bad_commands_are_dropped_and_good_ones_clipped(
@@ -145,16 +135,16 @@ def test_bad_commands_are_dropped_and_good_ones_clipped(
         robot.connect('commands')
         robot.spin_until(lambda: bool(robot.received['joint_states']), 'the reset')
         for bad in ([0.0] * 3, [0.0] * 5, [], [float('nan'), 0, 0, 0], [0, float('inf'), 0, 0]):
-            send(robot, *bad)
+            robot.command(*bad)
             robot.spin(0.1)
         # Warnings about commands do not silence those about goals.
         robot.connect('set_goal')
         far = build_message(topic(REACH, 'set_goal'), 0, [0.0, 0.0, 1e6])
         robot.publish('set_goal', serialize('geometry_msgs/msg/PointStamped', far))
-        send(robot, 0.0)
+        robot.command(0.0)
         robot.spin(0.3)
         assert robot.received['applied_command'] == []
-        send(robot, 0.25, -7.0, 1e300, 0.5)
+        robot.command(0.25, -7.0, 1e300, 0.5)
         robot.spin_until(lambda: bool(robot.received['applied_command']), 'a tick')
         assert list(robot.received['applied_command'][0].data) == [0.25, -1.0, 1.0, 0.5]
     sim.send_signal(signal.SIGINT)
@@ -167,16 +157,14 @@ def test_bad_commands_are_dropped_and_good_ones_clipped(
     assert len(episode.topics['/commands'].messages) == 7
 
 
-def test_robot_rests_before_the_first_command_and_holds_after_the_last(
-    start_process: Start,
-) -> None:
+def test_a_robot_rests_obeys_holds_pauses_steps_and_resets(start_process: Start) -> None:
     start_process(*SIM_NODE, *ros_args(command_timeout=0.2))
     with client(REACH) as robot:
-        robot.subscribe('applied_command')
+        robot.subscribe('applied_command', 'joint_states', 'episode_status', '/clock')
         robot.connect('commands')
         robot.spin_until(lambda: len(robot.received['applied_command']) > 3, 'ticks')
         assert list(robot.received['applied_command'][-1].data) == [0.0] * 4
-        send(robot, 0.5, 0.0, 0.0, 1.0)
+        robot.command(0.5, 0.0, 0.0, 1.0)
         seen = robot.received['applied_command']
         robot.spin_until(lambda: list(seen[-1].data) == [0.5, 0.0, 0.0, 1.0], 'the command')
         began = len(seen)
@@ -184,46 +172,17 @@ def test_robot_rests_before_the_first_command_and_holds_after_the_last(
         # Five ticks; a busy machine misses some.
         assert 1 <= len(seen) - began <= 8
 
-
-def test_clock_never_goes_back_over_resets(start_process: Start) -> None:
-    start_process(*SIM_NODE, *ros_args(real_time_factor=8.0))
-    with client(REACH) as robot:
-        robot.subscribe('/clock', 'episode_status')
-        robot.spin_until(lambda: len(robot.received['/clock']) > 200, 'ticks')
-        stamps = np.diff([message_stamp(message) for message in robot.received['/clock']])
-        assert len({status.seed for status in robot.statuses()}) > 1
-    assert (stamps > 0).all()
-    assert set(stamps % 40_000_000) == {0}
-
-
-def test_named_joint_commands_move_only_these_joints(start_process: Start) -> None:
-    spec = task_spec('HandReach')
-    start_process(*SIM_NODE, *ros_args(task='HandReach', mode='lockstep', wait_for_commands=True))
-    with client(spec) as robot:
-        robot.subscribe('applied_command', 'joint_states')
-        robot.connect('joint_commands')
-        robot.spin_until(lambda: bool(robot.received['joint_states']), 'the reset')
-        message = robot.publisher('joint_commands').msg_type()
-        message.name = ['robot0:THJ0', 'robot0:WRJ1']
-        message.position = [-0.5, 0.1]
-        robot.publish('joint_commands', message)
-        robot.spin_until(lambda: bool(robot.received['applied_command']), 'a tick')
-        applied = decode(topic(spec, 'applied_command'), robot.received['applied_command'][0])
-    assert applied[[0, -1]].tolist() == [0.1, -0.5]
-    assert not applied[1:-1].any()
-
-
-def test_pause_step_and_reset(start_process: Start) -> None:
-    start_process(*SIM_NODE)
-    with client(REACH) as robot:
-        robot.subscribe('joint_states', 'episode_status')
-        robot.spin_until(lambda: len(robot.received['joint_states']) > 2, 'ticks')
         assert not robot.call(Trigger, 'sim_node/step').success
         assert robot.call(SetBool, 'sim_node/pause', data=True).success
         robot.spin(0.2)
         count = len(robot.stamps('joint_states'))
         robot.spin(0.3)
         assert len(robot.stamps('joint_states')) == count
+        late, state = Client(REACH, 'late'), ('joint_states', 'achieved_goal', 'desired_goal')
+        late.subscribe(*state)
+        last = robot.stamps('joint_states')[-1:]
+        late.spin_until(lambda: all(late.stamps(name) == last for name in state), 'the last state')
+        late.close()
         assert robot.call(Trigger, 'sim_node/step').success
         robot.spin_until(lambda: len(robot.stamps('joint_states')) > count, 'a step')
         robot.spin(0.2)
@@ -236,15 +195,17 @@ def test_pause_step_and_reset(start_process: Start) -> None:
         robot.spin_until(lambda: len(robot.stamps('joint_states')) > count + 1, 'its state')
         robot.spin(0.2)
         assert len(robot.stamps('joint_states')) == count + 2
+        assert robot.set_parameter('sim_node', 'real_time_factor', 8.0).successful
         assert robot.call(SetBool, 'sim_node/pause', data=False).success
-        robot.spin_until(lambda: len(robot.stamps('joint_states')) > count + 4, 'ticks')
+        robot.spin_until(lambda: robot.statuses()[-1].episode > episode + 2, 'more episodes')
+        stamps = np.diff(robot.stamps('/clock'))
+    assert (stamps > 0).all() and set(stamps % 40_000_000) == {0}
 
 
 def test_a_robot_that_waits_for_commands_can_be_seeded_and_stepped(start_process: Start) -> None:
     start_process(*SIM_NODE, *ros_args(wait_for_commands=True))
     with client(REACH) as robot:
-        seed = Parameter(name='seed', value=ParameterValue(type=2, integer_value=9))
-        robot.call(SetParameters, 'sim_node/set_parameters', parameters=[seed])
+        assert robot.set_parameter('sim_node', 'seed', 9).successful
         # Late subscribers receive it, too.
         robot.subscribe('episode_status', '/clock')
         robot.spin_until(
@@ -285,10 +246,10 @@ def test_killed_simulation_leaves_finished_episodes_and_a_marked_rest(
     start_process: Start, tmp_path: Path
 ) -> None:
     sim = start_process(*SIM_NODE, *ros_args(episode_dir=tmp_path, real_time_factor=4.0))
-    deadline = time.monotonic() + TIMEOUT
-    while len(list(tmp_path.glob('FetchReach_*'))) < 2 or not list(tmp_path.glob('.*.active')):
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
+    wait_until(
+        lambda: len([*tmp_path.glob('FetchReach_*')]) > 1 and [*tmp_path.glob('.*.active')],
+        'two episodes and one that runs',
+    )
     sim.kill()
     sim.wait()
     assert all(episode.is_complete for episode in episodes_in(tmp_path))

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
+from rclpy.parameter import Parameter as RclpyParameter
 from std_msgs.msg import Float64MultiArray
 
 from msgs_spec.codecs import TopicCodec, message_stamp
@@ -40,7 +41,9 @@ def resident_kilobytes(process: subprocess.Popen[str]) -> int:
 
 
 @pytest.mark.alone
-def test_flood_of_commands_neither_delays_nor_grows_the_robot(start_process: Start) -> None:
+def test_neither_a_stop_nor_a_flood_of_commands_disturbs_the_robot_for_long(
+    start_process: Start,
+) -> None:
     sim = start_process(*SIM_NODE)
     source = topic(REACH, 'commands')
     good = TopicCodec(source).encode(0, np.full(4, 0.1))
@@ -48,9 +51,22 @@ def test_flood_of_commands_neither_delays_nor_grows_the_robot(start_process: Sta
     with client(REACH) as robot:
         robot.subscribe('joint_states', '/diagnostics')
         robot.connect('commands')
-        robot.spin_until(lambda: len(robot.received['joint_states']) > 5, 'ticks')
+        robot.spin_until(lambda: bool(robot.reports()), 'a report')
+        before = int(robot.values()['missed ticks'])
+        sim.send_signal(signal.SIGSTOP)
+        robot.spin(2.0)
+        sim.send_signal(signal.SIGCONT)
+        robot.spin(0.05)
+        began, count = time.monotonic(), len(robot.received['joint_states'])
+        robot.spin(1.5)
+        rate = (len(robot.received['joint_states']) - count) / (time.monotonic() - began)
+        robot.spin_until(lambda: int(robot.values()['missed ticks']) - before >= 45, 'report')
+        # 50 missed ticks and 25 Hz on a quiet machine: it never catches up.
+        assert int(robot.values()['missed ticks']) - before <= 80
+        assert 12.5 < rate < 27.0
+
         robot.publish('commands', Float64MultiArray(data=np.zeros(1_000_000)))
-        robot.spin(0.5)
+        robot.spin_until(lambda: int(robot.values()['rejected: too long']) == 1, 'rejection')
         before, sent = resident_kilobytes(sim), 0
         began = time.monotonic()
         while (elapsed := time.monotonic() - began) < 3.0:
@@ -72,7 +88,6 @@ def test_flood_of_commands_neither_delays_nor_grows_the_robot(start_process: Sta
         during = [message_stamp(state) for state, at in states if began < at < began + 3.0]
         # By the robot's own time: who floods it misses messages itself.
         rate = (during[-1] - during[0]) * 1e-9 * DEFAULT_CONTROL_HZ / 3.0
-        assert int(robot.values()['rejected: too long']) == 1
     # 25 on a machine with a processor to spare; a robot that reads all that comes has next to none.
     assert rate > 12.5
     assert grown < 20_000
@@ -120,18 +135,10 @@ def test_hostile_messages_on_every_input_leave_robot_policy_and_log_sound(
 
 def random_value(generator: np.random.Generator) -> ParameterValue:
     number = float(generator.choice([np.nan, np.inf, -np.inf, 5e-324, 1e308, -1.0, 0.0, 2.0]))
-    return [
-        ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=number),
-        ParameterValue(type=ParameterType.PARAMETER_INTEGER, integer_value=-(2**63)),
-        ParameterValue(type=ParameterType.PARAMETER_STRING, string_value='x' * 100_000),
-        ParameterValue(type=ParameterType.PARAMETER_BOOL, bool_value=True),
-        ParameterValue(
-            type=ParameterType.PARAMETER_DOUBLE_ARRAY, double_array_value=[number] * 1000
-        ),
-        ParameterValue(),
-        # An unknown type, for which rclpy raises an error.
-        ParameterValue(type=200, string_value='x'),
-    ][generator.integers(7)]
+    values = [number, -(2**63), 'x' * 100_000, True, [number] * 1000, None]
+    # The last one is an unknown type, for which rclpy raises an error.
+    parameters = [RclpyParameter('x', value=value).get_parameter_value() for value in values]
+    return [*parameters, ParameterValue(type=200, string_value='x')][generator.integers(7)]
 
 
 def test_random_parameters_are_answered_and_only_allowed_ones_applied(
@@ -164,30 +171,6 @@ def test_random_parameters_are_answered_and_only_allowed_ones_applied(
         assert together.result.reason.startswith('real_time_factor: type 200 given; allowed: 0 (NO')
         count = len(robot.received['joint_states'])
         robot.spin_until(lambda: len(robot.received['joint_states']) > count + 20, 'ticks')
-    end(sim)
-
-
-@pytest.mark.alone
-def test_a_stopped_simulation_counts_missed_ticks_and_never_catches_up(
-    start_process: Start,
-) -> None:
-    sim = start_process(*SIM_NODE)
-    with client(REACH) as robot:
-        robot.subscribe('joint_states', '/diagnostics')
-        robot.spin_until(lambda: bool(robot.reports()), 'a report')
-        before = int(robot.values()['missed ticks'])
-        sim.send_signal(signal.SIGSTOP)
-        robot.spin(2.0)
-        sim.send_signal(signal.SIGCONT)
-        robot.spin(0.05)
-        began, count = time.monotonic(), len(robot.received['joint_states'])
-        robot.spin(2.0)
-        rate = (len(robot.received['joint_states']) - count) / (time.monotonic() - began)
-        robot.spin_until(lambda: int(robot.values()['missed ticks']) - before >= 45, 'report')
-        missed = int(robot.values()['missed ticks']) - before
-    # 50 missed ticks and 25 Hz on a quiet machine.
-    assert missed <= 80
-    assert 12.5 < rate < 27.0
     end(sim)
 
 

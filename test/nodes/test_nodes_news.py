@@ -6,11 +6,8 @@ import re
 import signal
 from pathlib import Path
 
-import pytest
 from std_msgs.msg import Float64MultiArray
-from std_srvs.srv import SetBool
 
-from msgs_spec.codecs import message_stamp
 from msgs_spec.tasks import task_spec
 from msgs_spec.topics import QosSpec
 from node_runtime.ros import rclpy_profile
@@ -112,24 +109,3 @@ def test_publishers_that_the_robot_cannot_receive_are_reported(start_process: St
         )
     output = end(sim)
     assert all(line in output for line in lines)
-
-
-@pytest.mark.parametrize('mode', ['realtime', 'lockstep'])
-def test_a_late_subscriber_of_a_standing_robot_receives_its_last_state(
-    start_process: Start, mode: str
-) -> None:
-    sim = start_process(*SIM_NODE, *ros_args(mode=mode))
-    with client(REACH, 'early') as robot:
-        robot.subscribe('joint_states')
-        robot.spin_until(lambda: bool(robot.received['joint_states']), 'a tick')
-        if mode == 'realtime':
-            assert robot.call(SetBool, 'sim_node/pause', data=True).success
-        robot.spin(0.2)
-        last = message_stamp(robot.received['joint_states'][-1])
-    with client(REACH, 'late') as robot:
-        names = ('joint_states', 'end_effector_pose', 'achieved_goal', 'desired_goal')
-        robot.subscribe(*names, 'episode_status')
-        robot.spin_until(lambda: len(robot.received) == 5, 'the last state')
-        assert {message_stamp(robot.received[name][0]) for name in names} == {last}
-        assert robot.statuses()[-1].task == 'FetchReach'
-    end(sim)

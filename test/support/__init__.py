@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 SUPPORT = Path(__file__).resolve().parent
@@ -28,3 +30,27 @@ def peak_memory() -> int:
     status = Path('/proc/self/status').read_text()
     (line,) = (line for line in status.splitlines() if line.startswith('VmHWM'))
     return int(line.split()[1]) * 1024
+
+
+def wait_until(condition: Callable[[], object], what: str, seconds: float = 30.0) -> None:
+    """Waits for a condition; fails with `what` was awaited."""
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, f'no {what} within {seconds} s'
+        time.sleep(0.02)
+
+
+def stat_of(process: int) -> list[str]:
+    """State, parent, group, session and what follows of a process; empty if it is gone."""
+    try:
+        return Path(f'/proc/{process}/stat').read_text().rpartition(')')[2].split()
+    except OSError:
+        return []
+
+
+def is_running(process: int) -> bool:
+    return stat_of(process)[:1] not in ([], ['Z'])
+
+
+def running_processes() -> list[int]:
+    return [int(path.name) for path in Path('/proc').glob('[0-9]*') if is_running(int(path.name))]

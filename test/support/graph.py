@@ -15,13 +15,17 @@ from typing import Any
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticStatus
+from rcl_interfaces.msg import SetParametersResult
+from rcl_interfaces.srv import SetParameters
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.parameter import Parameter
+from std_msgs.msg import Float64MultiArray
 
 from fetch_hand_sim.episode_log import Episode, read_episode
 from msgs_spec.codecs import decode_status, message_stamp
 from msgs_spec.tasks import TaskSpec
 from msgs_spec.tick import EpisodeStatus
-from msgs_spec.topics import MONITORING, TopicSpec, topic, topics
+from msgs_spec.topics import MONITORING, TopicSpec, topic, topics, view_topics
 from node_runtime.ros import open_publisher, subscribe
 
 SIM_NODE = (sys.executable, '-m', 'fetch_hand_sim.sim_node')
@@ -70,9 +74,9 @@ def payload(episode: Episode) -> dict[str, list[tuple[int, int, bytes]]]:
 class Client:
     """Receives every topic of a robot and sends commands."""
 
-    def __init__(self, spec: TaskSpec, name: str = 'client') -> None:
+    def __init__(self, spec: TaskSpec, name: str = 'client', namespace: str = '') -> None:
         self.spec = spec
-        self.node = rclpy.create_node(name)
+        self.node = rclpy.create_node(name, namespace=namespace)
         self.received: dict[str, list[Any]] = defaultdict(list)
         self.received_at: dict[str, list[float]] = defaultdict(list)
         self._executor = SingleThreadedExecutor()
@@ -95,6 +99,9 @@ class Client:
             self._publishers[name] = open_publisher(self.node, topic(self.spec, name))
         return self._publishers[name]
 
+    def command(self, *values: float) -> None:
+        self.publish('commands', Float64MultiArray(data=[float(value) for value in values]))
+
     def connect(self, name: str) -> None:
         """Waits until the robot listens to a topic."""
         publisher = self.publisher(name)
@@ -108,13 +115,13 @@ class Client:
     def spin_until(
         self, condition: Callable[[], bool], what: str, timeout: float = TIMEOUT
     ) -> None:
-        """Spin until a condition holds; it may index messages that have not come yet."""
+        """Spin until a condition holds; it may use messages that have not come yet."""
         end = time.monotonic() + timeout
 
         def holds() -> bool:
             try:
                 return bool(condition())
-            except IndexError:
+            except LookupError:
                 return False
 
         while not holds():
@@ -130,9 +137,16 @@ class Client:
         self.spin_until(future.done, f'answer of {name}')
         return future.result()
 
+    def set_parameter(self, node: str, name: str, value: object) -> SetParametersResult:
+        parameter = Parameter(name, value=value).to_parameter_msg()
+        answer = self.call(SetParameters, f'{node}/set_parameters', parameters=[parameter])
+        (result,) = answer.results
+        return result
+
     def stamps(self, name: str) -> list[int]:
         """The stamps received on a topic, each once: a robot that stands still repeats itself."""
-        return list(dict.fromkeys(message_stamp(message) for message in self.received[name]))
+        parts = (getattr(m, 'markers', getattr(m, 'transforms', [m])) for m in self.received[name])
+        return list(dict.fromkeys(message_stamp(part[0]) for part in parts))
 
     def statuses(self) -> list[EpisodeStatus]:
         messages = self.received['episode_status']
@@ -152,8 +166,8 @@ class Client:
         self.node.destroy_node()
 
     def _topic(self, name: str) -> TopicSpec:
-        monitoring = {spec.name: spec for spec in MONITORING}
-        return monitoring[name] if name in monitoring else topic(self.spec, name)
+        others = {spec.name: spec for spec in (*MONITORING, *view_topics(self.spec))}
+        return others.get(name) or topic(self.spec, name)
 
     def _collector(self, name: str) -> Callable[[Any], None]:
         def collect(message: Any) -> None:
@@ -164,10 +178,10 @@ class Client:
 
 
 @contextmanager
-def client(spec: TaskSpec, name: str = 'client') -> Iterator[Client]:
+def client(spec: TaskSpec, name: str = 'client', namespace: str = '') -> Iterator[Client]:
     """A client on the private graph of this test run."""
     rclpy.init()
-    connection = Client(spec, name)
+    connection = Client(spec, name, namespace)
     try:
         yield connection
     finally:

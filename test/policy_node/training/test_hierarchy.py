@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,11 +18,15 @@ from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.flat import from_flat
 from policy_node.training.configuration.recipes import recipe_config
 from policy_node.training.experience.replay import Episodes
+from policy_node.training.experience.sampling import TransitionSampler
 from policy_node.training.machine import Workers
 from policy_node.training.research.hierarchy import (
+    LOW_SOURCES,
     TESTED,
+    GuidedCollector,
     GuidedPolicy,
     HierarchicalDDPG,
+    HierarchicalExperience,
     Proposer,
     SubgoalSampler,
     with_subgoals,
@@ -95,6 +100,63 @@ def test_a_high_level_proposes_what_can_be_reached_on_the_way() -> None:
     assert far == pytest.approx(-0.7 + REACH, abs=0.15), 'one out of reach as far as one gets'
     untested = proposals(tested=0.0, updates=300)[1]
     assert untested > 0.5, 'without tests nothing says what cannot be reached'
+
+
+class Line:
+    """Simulations of a point on a line, by a tenth a tick, with goals up to 1.5 away."""
+
+    def __init__(self, num_envs: int) -> None:
+        sizes = {'observation_size': 1, 'episode_ticks': 30, 'has_object': False}
+        goal, robot = SimpleNamespace(size=1), SimpleNamespace(action_size=1)
+        self.spec = SimpleNamespace(goal=goal, robot=robot, **sizes)
+        self.num_envs, self.generator = num_envs, make_generator()
+
+    def _seen(self) -> dict[str, np.ndarray]:
+        return {
+            'observation': self.place,
+            'achieved_goal': self.place,
+            'desired_goal': self.goal,
+        }
+
+    def reset(self, seed: object = None) -> dict[str, np.ndarray]:
+        self.place = np.zeros((self.num_envs, 1))
+        self.goal = self.generator.uniform(-1.5, 1.5, (self.num_envs, 1))
+        return self._seen()
+
+    def step(self, action: np.ndarray) -> SimpleNamespace:
+        self.place = self.place + 0.1 * np.clip(action, -1, 1)
+        success = reached(self.place, self.goal) == 0.0
+        never = np.zeros(self.num_envs, np.bool_)
+        return SimpleNamespace(observation=self._seen(), success=success, diverged=never)
+
+
+@pytest.mark.release
+def test_both_levels_learn_a_line_together() -> None:
+    """Episodes are collected through subgoals; goals are reached with and without them."""
+    torch.manual_seed(0)
+    changes = {'num_envs': 32, 'batch_size': 256, 'gamma': 0.95, 'goal_features': 'plain'}
+    changes |= {'noise_std': 0.2, 'random_epsilon': 0.3}
+    config, line, generator = configured(**changes), Line(32), make_generator()
+    learner = HierarchicalDDPG(SHAPE, config, CPU, Workers())
+    sampler = TransitionSampler(reached, config.tick_gamma, sources=LOW_SOURCES)
+    experience = HierarchicalExperience(config, line.spec, Workers(), sampler, generator, 2)
+    collector = GuidedCollector(line, [0] * 32, config)
+    for cycle in range(20):
+        policy = learner.acting_policy()
+        assert isinstance(policy, GuidedPolicy) == (cycle > 0), 'no proposals before learning'
+        episodes, _ = collector.collect(policy)
+        experience.replay.add(episodes)
+        experience.normalize(episodes, learner.actor)
+        for _ in range(40):
+            learner.update(experience.batch(0))
+        learner.average()
+    alone, proposer = learner.evaluation_actor(), learner.high.proposer(averaged=True)
+    for policy in (alone, GuidedPolicy(alone, proposer, 10, 30)):
+        observation = line.reset()
+        for _ in range(30):
+            result = line.step(policy.predict(observation)[0])
+            observation = result.observation
+        assert result.success.mean() > 0.9
 
 
 SMALL = {'num_envs': 8, 'updates_per_cycle': 4, 'batch_size': 64, 'evaluation_episodes': 8}
