@@ -106,18 +106,12 @@ def test_unreadable_status_is_refused(change, message):
         EpisodeStatus.from_values(values)
 
 
-@pytest.mark.parametrize(
-    ('change', 'is_same'),
-    [
-        ({'tick': 2, 'episode': 4, 'reward_type': 'sparse'}, True),
-        ({'task': 'FetchSlide'}, False),
-        ({'control_hz': 25.0}, False),
-        ({'joint_prefix': 'rh_'}, False),
-    ],
-)
-def test_another_robot_is_one_whose_messages_mean_something_else(change, is_same):
+def test_another_robot_is_one_whose_messages_mean_something_else():
     status = episode_status(TASKS['FetchPush'])
-    assert status.is_of_same_robot(dataclasses.replace(status, **change)) == is_same
+    other = dataclasses.replace(status, tick=2, episode=4, reward_type='sparse')
+    assert status.is_of_same_robot(other)
+    for change in ({'task': 'FetchSlide'}, {'control_hz': 25.0}, {'joint_prefix': 'rh_'}):
+        assert not status.is_of_same_robot(dataclasses.replace(status, **change))
 
 
 def test_an_unknown_topic_is_rejected_by_name():

@@ -109,22 +109,6 @@ def test_physics_varies_and_the_model_stays(disturbances, field: str, place: str
         assert np.allclose(one, factor * other)
 
 
-def test_less_friction_lets_a_puck_slide_further() -> None:
-    reached = {}
-    for friction in (0.2, 1.0):
-        disturbances = {'physics': {'friction': friction}}
-        simulation = Simulation('FetchSlide', 1, keeps_data=True, disturbances=disturbances)
-        simulation.reset(seed=0)
-        data = mujoco.MjData(simulation.model)
-        simulation.read_data(0, data)
-        data.joint('object0:joint').qvel[0] = 0.3
-        simulation.write_data(0, data)
-        for _ in range(20):
-            result = simulation.step(np.zeros((1, 4), np.float32))
-        reached[friction] = result.observation['achieved_goal'][0, 0]
-    assert reached[0.2] > reached[1.0]
-
-
 def test_a_stale_pose_is_repeated_while_pushes_move_the_object() -> None:
     disturbances = {
         'action': {'latency': [0, 2]},

@@ -38,19 +38,8 @@ def contacts(model: mujoco.MjModel, state: np.ndarray) -> list[bytes]:
     data = mujoco.MjData(model)
     mujoco.mj_setState(model, data, state, mujoco.mjtState.mjSTATE_INTEGRATION)
     mujoco.mj_forward(model, data)
-    c = data.contact
-    fields = (
-        c.geom,
-        c.dist,
-        c.pos,
-        c.frame,
-        c.friction,
-        c.solref,
-        c.solimp,
-        c.includemargin,
-        c.dim,
-    )
-    return [field.tobytes() for field in fields]
+    names = ('geom', 'dist', 'pos', 'frame', 'friction', 'solref', 'solimp', 'includemargin', 'dim')
+    return [getattr(data.contact, name).tobytes() for name in names]
 
 
 @pytest.mark.parametrize(

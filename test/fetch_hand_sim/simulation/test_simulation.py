@@ -171,15 +171,6 @@ def test_bad_simulations_are_refused(arguments, message):
         Simulation(**({'task': 'FetchReach'} | arguments))
 
 
-@pytest.mark.parametrize('substeps', [1, 4, 40])
-def test_the_control_rate_sets_the_simulated_time_of_a_tick(substeps):
-    simulation = Simulation('FetchReach', control_hz=500 / substeps)
-    simulation.reset(seed=[0])
-    start = simulation.data(0).time
-    simulation.step(np.zeros((1, 4)))
-    assert simulation.data(0).time - start == pytest.approx(0.002 * substeps)
-
-
 class GivesUp:
     """A batch whose third simulation diverges at the next step."""
 
