@@ -22,13 +22,13 @@ class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32
     """One task with dictionary observations, for hindsight experience replay.
 
     Episodes never terminate; `gymnasium.make` truncates them after the task's number of steps. Give
-    it the keyword arguments of this class. `pickle` and `copy` keep the state: they go on to the
-    same bits, and have no physics in common.
+    it the keyword arguments of this class. Copies by `pickle` or `copy` have their own physics and
+    continue from the same state, bit for bit.
 
-    Subclasses, and who has the object, may bring methods of Gymnasium-Robotics' names:
-    `_sample_goal()`, `_get_obs()`, `_is_success(achieved_goal, desired_goal)`, and
+    A subclass may override methods that Gymnasium-Robotics has, or a user may set them on the
+    object: `_sample_goal()`, `_get_obs()`, `_is_success(achieved_goal, desired_goal)`, and
     `compute_terminated`, `compute_truncated` and `compute_reward` (achieved_goal, desired_goal,
-    info). Resets and steps ask them, in the order of the reference.
+    info). Resets and steps then call them, in the order of the reference.
 
     Arguments are those of `TaskAttributes`.
 
@@ -50,7 +50,7 @@ class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Starts an episode.
+        """Start an episode.
 
         Args:
             seed: Seed of the random generator; None continues it.
@@ -86,19 +86,19 @@ class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32
     def step(
         self, action: NDArray[np.float32]
     ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Advances one tick.
+        """Advance one tick.
 
         Args:
-            action: (action size,); what lies outside [-1, 1], also infinitely far, is clipped.
+            action: (action size,), clipped to [-1, 1]; infinite values, too.
 
         Returns:
-            Observation, reward, terminated (never), truncated (only if MuJoCo lost the simulation:
-            the observation is then the first of a new episode) and a dictionary with `is_success`
-            and `diverged`. Methods that a subclass overrides may say otherwise.
+            Observation, reward, terminated (always False), truncated (True if MuJoCo diverged; the
+            observation is then the first of a new episode) and a dictionary with `is_success` and
+            `diverged`. Overridden methods may decide otherwise.
 
         Raises:
             ValueError: If the action has a wrong shape, or a value is not a number (NaN).
-            gymnasium.error.ResetNeeded: If it was never reset.
+            gymnasium.error.ResetNeeded: If `reset` was never called.
         """
         given = np.asarray(action)
         if given.shape != self.action_space.shape:
@@ -124,7 +124,7 @@ class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32
         return observation, float(reward), False, diverged, info
 
     def _evaluate(self, diverged: bool) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Return the result of a step from the methods, in the order of `robot_env.py`."""
+        """Return the result of a step from methods that may be overridden, as `robot_env.py`."""
         observation = self._get_obs()
         goals = observation['achieved_goal'], self.goal
         info = {'is_success': self._is_success(*goals), 'diverged': diverged}
@@ -135,12 +135,12 @@ class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32
 
     @property
     def model(self) -> Any:
-        """The compiled `mujoco.MjModel`; what is written into it counts from the next call on."""
+        """The compiled `mujoco.MjModel`; changes take effect in the next call."""
         return self._physics.model
 
     @property
     def data(self) -> Any:
-        """The `mujoco.MjData`, live; what is written into it counts from the next call on."""
+        """The live `mujoco.MjData`; changes take effect in the next call."""
         return self._physics.data
 
     @property
@@ -151,7 +151,7 @@ class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32
 
     @property
     def goal(self) -> Array:
-        """The desired goal of this episode, (goal size,), live until there is another."""
+        """The desired goal of this episode, (goal size,); a view, valid until the next reset."""
         return np.asarray(self.simulation.goals[0])
 
     @goal.setter
@@ -162,15 +162,15 @@ class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32
         self.simulation.goals = given[None].copy()
 
     def render(self) -> Image | None:
-        """Returns a picture of the robot and its goal.
+        """Render a picture of the robot and its goal.
 
         Returns:
             `rgb_array`: (height, width, 3) bytes. `depth_array`: (height, width), metres from the
             camera plane. `human`: None, after drawing into a window. None without a render mode.
 
         Raises:
-            RuntimeError: If there is no OpenGL or, for `human`, no display, or an OpenGL that draws
-                in the thread of the first picture only.
+            RuntimeError: If there is no OpenGL or, for `human`, no display, or if another thread
+                rendered the first picture and the OpenGL backend does not allow that.
         """
         if self.render_mode is None:
             return None
@@ -178,16 +178,16 @@ class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32
         return self._pictures.render(self.render_mode)
 
     def close(self) -> None:
-        """Frees renderer and window."""
+        """Close renderer and window."""
         self._pictures.close()
 
     def __getstate__(self) -> dict[str, Any]:
-        """Everything but what belongs to this process; writes into `model` and `data` included."""
+        """Return the state for `pickle`, with changes of `model` and `data`, without OpenGL."""
         self._physics.send()
         return self.__dict__.copy()
 
     def _draws_goals(self) -> bool:
-        """Lets the simulation draw goals, unless `_sample_goal` is overridden; which of both."""
+        """Return whether the simulation draws goals, and tell it; False if `_sample_goal` does."""
         draws_goals = not self.overrides('_sample_goal')
         self.simulation.task.draws_goals = draws_goals
         return draws_goals
@@ -232,7 +232,7 @@ class SharedPhysics:
     _unchanged: bytes | None = None
 
     def __init__(self, simulation: Simulation) -> None:
-        """Shares the first copy of a simulation that keeps its data."""
+        """Share copy 0 of a simulation that was made with `keeps_data`."""
         self._simulation = simulation
         self._data: mujoco.MjData | None = None
         self._shares_model = False
@@ -264,7 +264,7 @@ class SharedPhysics:
         return self._data is not None
 
     def move_sites(self, sites: list[int], positions: Array) -> None:
-        """Move sites (n,) of the model to (n, 3) in m that only pictures show."""
+        """Move sites (n,) of the model to positions (n, 3), m; only pictures show these sites."""
         is_unchanged = self._is_unchanged()
         self._simulation.model.site_pos[sites] = positions
         if is_unchanged:
@@ -276,24 +276,24 @@ class SharedPhysics:
         return self._unchanged == _saved(self._simulation.model)
 
     def send(self) -> None:
-        """Takes over what was written; to be called before anything is computed."""
+        """Copy changes of `model` and `data` to the simulation, before a computation."""
         if self._shares_model and not self._is_unchanged():
             self._simulation.apply_model_changes()
         if self._data is not None:
             self._simulation.write_data(0, self._data)
 
     def receive(self) -> None:
-        """Shows what was computed."""
+        """Copy the state of the simulation into `data`, after a computation."""
         if self._data is not None:
             self._simulation.read_data(0, self._data)
 
     def __getstate__(self) -> dict[str, Any]:
-        """The data is read from the simulation again."""
+        """Return the state for `pickle` without `data`, which is read from the simulation again."""
         return self.__dict__ | {'_data': None}
 
 
 def _saved(model: mujoco.MjModel) -> bytes:
-    """Return the bytes of a model."""
+    """Return a model in the binary format MJB."""
     buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
     mujoco.mj_saveModel(model, None, buffer)
     return buffer.tobytes()

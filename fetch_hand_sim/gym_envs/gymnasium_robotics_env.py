@@ -1,8 +1,8 @@
 """The tasks as code written for Gymnasium-Robotics 1.4.2 expects them.
 
 Names, types and defaults are the reference's (`robot_env.py`, `fetch_env.py`, `reach.py`,
-`manipulate.py`). Of the hooks that its subclasses override, those of goals, observations and
-endings are there; `docs/gymnasium_robotics.md` lists what is equal and what differs.
+`manipulate.py`). Subclasses may override its methods for goals, observations and the end of
+episodes. `docs/gymnasium_robotics.md` lists what is equal and what differs.
 """
 
 from __future__ import annotations
@@ -48,8 +48,8 @@ def _is_ours(spec: gymnasium.envs.registration.EnvSpec) -> bool:
 def import_goal_env() -> Any:
     """Return `gymnasium_robotics.core.GoalEnv`, or `gymnasium.Env` if it is not installed.
 
-    Importing Gymnasium-Robotics registers its environments and prints a remark. Ids of this package
-    stay as they are, and the remark is dropped.
+    Importing Gymnasium-Robotics registers its environments and prints a note. This function keeps
+    the ids of this package and suppresses the note.
     """
     ours = {name: spec for name, spec in gymnasium.registry.items() if _is_ours(spec)}
     for name in ours:
@@ -89,13 +89,13 @@ CAMERAS: dict[str, dict[str, Any]] = {
 
 
 def _pictures(task: str, camera: Mapping[str, Any] | None) -> dict[str, Any]:
-    """Return the reference's size and view, with changes to its camera."""
+    """Return picture size and camera of the reference, with the changes `camera`."""
     view = {**CAMERAS[task_spec(task).robot.name], **(camera or {})}
     return {'width': SIZE, 'height': SIZE, 'default_camera_config': view}
 
 
 def as_reference(reward: Any, reward_type: str) -> Any:
-    """A reward, or an array of them, with the reference's type: float32 if it is sparse."""
+    """Convert one reward or an array to the reference's type: float32 if sparse."""
     return reward.astype(np.float32) if reward_type == 'sparse' else reward
 
 
@@ -105,9 +105,8 @@ class RobotEnv(FetchHandEnv, GoalEnv):
     Attributes:
         n_substeps: Physics steps per action.
         initial_time: Simulated time at which episodes start, s.
-        initial_qpos: Joint positions from which they start, before anything is drawn; read-only, as
-            all arrays of facts.
-        initial_qvel: Joint velocities likewise.
+        initial_qpos: Joint positions at the start of an episode, before random draws; read-only.
+        initial_qvel: Joint velocities at the start of an episode; read-only.
         fullpath: The MJCF file.
     """
 
@@ -128,7 +127,7 @@ class RobotEnv(FetchHandEnv, GoalEnv):
         default_camera_config: Mapping[str, Any] | None = None,
         **arguments: Any,
     ) -> None:
-        """Compiles the model; arguments as `FetchHandEnv` has them."""
+        """Compile the model; arguments as `FetchHandEnv`."""
         self._mujoco_renderer: Any = None
         pictures = _pictures(task, default_camera_config)
         self._camera = pictures['default_camera_config']
@@ -146,7 +145,7 @@ class RobotEnv(FetchHandEnv, GoalEnv):
         )
 
     def __setattr__(self, name: str, value: Any) -> None:
-        """Reject other values of facts."""
+        """Reject a new value for an attribute that states a fact about the task."""
         if name in self.__dict__.get('_stated', ()):
             raise AttributeError(
                 f'{name} of {self.spec_of_task.name} is fixed; for other values write a task of '
@@ -156,12 +155,12 @@ class RobotEnv(FetchHandEnv, GoalEnv):
 
     @property
     def stated(self) -> frozenset[str]:
-        """Names of the attributes that are facts about the task."""
+        """Names of the read-only attributes that state facts about the task."""
         own: frozenset[str] = self.__dict__['_stated']
         return own | {'has_object'}
 
     def _state(self, **facts: Any) -> None:
-        """Makes facts about the task attributes that cannot be changed, arrays included."""
+        """Set facts about the task as read-only attributes; their arrays are read-only, too."""
         stated: frozenset[str] = self.__dict__.get('_stated', frozenset())
         for fact in facts.values():
             for array in fact if isinstance(fact, tuple) else (fact,):
@@ -173,13 +172,13 @@ class RobotEnv(FetchHandEnv, GoalEnv):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Starts an episode; options are ignored, as the reference does."""
+        """Start an episode; options are ignored, as in the reference."""
         started = super().reset(seed=seed)
         self._show_goal()
         return started
 
     def step(self, action: Any) -> tuple[Observation, Any, bool, bool, dict[str, Any]]:
-        """Advances one tick, with the reference's types: sparse rewards and successes float32."""
+        """Advance one tick; sparse rewards and `is_success` are float32, as in the reference."""
         observation, reward, terminated, truncated, info = super().step(action)
         self._show_goal()
         if not self.overrides('_is_success'):
@@ -189,7 +188,7 @@ class RobotEnv(FetchHandEnv, GoalEnv):
         return observation, reward, terminated, truncated, info
 
     def compute_reward(self, achieved_goal: ArrayLike, goal: ArrayLike, info: Any = None) -> Any:
-        """Reward of goals of any batch shape: float32 if sparse, a number for a single goal."""
+        """Return rewards of goals of any batch shape: float32 if sparse, a scalar for one goal."""
         reward = super().compute_reward(achieved_goal, goal, info)[()]
         return as_reference(reward, self.reward_type)
 
@@ -216,14 +215,14 @@ class RobotEnv(FetchHandEnv, GoalEnv):
 
     @property
     def data(self) -> Any:
-        """As `FetchHandEnv.data`, with the goal at its place."""
+        """The live `mujoco.MjData`, as in `FetchHandEnv`, with the target sites at the goal."""
         data = super().data
         self._show_goal()
         return data
 
     @property
     def mujoco_renderer(self) -> Any:
-        """Gymnasium's renderer of `model` and `data`."""
+        """Gymnasium's `MujocoRenderer` for `model` and `data`."""
         if self._mujoco_renderer is None:
             size = self.width, self.height
             self._mujoco_renderer = mujoco_renderer(self.model, self.data, self._camera, *size)
@@ -246,18 +245,18 @@ class RobotEnv(FetchHandEnv, GoalEnv):
         return self._utils.MujocoModelNames(self.model)
 
     def close(self) -> None:
-        """Frees renderers and window."""
+        """Close renderers and window."""
         super().close()
         if self._mujoco_renderer is not None:
             self._mujoco_renderer.close()
             self._mujoco_renderer = None
 
     def __getstate__(self) -> dict[str, Any]:
-        """As `FetchHandEnv`, without OpenGL."""
+        """Return the state for `pickle`, without Gymnasium's renderer."""
         return super().__getstate__() | {'_mujoco_renderer': None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Goes on from the state; copies of arrays are writable until they are stated again."""
+        """Restore the state; make the arrays of facts read-only again."""
         self.__dict__.update(state)
         self._state(**{name: state[name] for name in state['_stated']})
 
@@ -272,7 +271,7 @@ class RobotEnv(FetchHandEnv, GoalEnv):
             self._draw_goal(self._physics.data)
 
     def _draw_goal(self, data: Any) -> None:
-        """Move the target sites; the physics does not depend on them."""
+        """Move the target sites to the goal; they do not change the physics."""
         data.site_xpos[self._target_sites] = self.goal.reshape(-1, 3)
 
     def _keep_goal(self) -> None:
@@ -292,9 +291,9 @@ class FetchEnv(RobotEnv):
     """`fetch_env.py`: FetchReach, FetchPush, FetchSlide, FetchPickAndPlace.
 
     Attributes:
-        initial_gripper_xpos: (3,) where the gripper starts, m.
-        height_offset: Where the object's centre rests, m; only with an object.
-        gripper_extra_height: Added to the gripper's starting height, m.
+        initial_gripper_xpos: (3,) start position of the gripper, m.
+        height_offset: Height of the resting object's centre, m; only with an object.
+        gripper_extra_height: Added to the start height of the gripper, m.
         block_gripper: Whether the fingers are locked shut.
         target_in_the_air: Whether goals may be above the table.
         target_offset: Added to goals, (3,) m, or 0.
@@ -303,7 +302,7 @@ class FetchEnv(RobotEnv):
     """
 
     def __init__(self, task: str, **arguments: Any) -> None:
-        """Compiles the model; arguments as `FetchHandEnv` has them."""
+        """Compile the model; arguments as `FetchHandEnv`."""
         super().__init__(task, **arguments)
         physics = self.simulation.task
         assert isinstance(physics, FetchTask)
@@ -329,13 +328,13 @@ class HandReachEnv(RobotEnv):
     """`shadow_dexterous_hand/reach.py`.
 
     Attributes:
-        initial_goal: (15,) the fingertips of the initial pose, m.
-        palm_xpos: (3,) where the palm is, m.
-        relative_control: Never.
+        initial_goal: (15,) fingertip positions in the initial pose, m.
+        palm_xpos: (3,) position of the palm, m.
+        relative_control: Always False.
     """
 
     def __init__(self, task: str = 'HandReach', **arguments: Any) -> None:
-        """Compiles the model; arguments as `FetchHandEnv` has them."""
+        """Compile the model; arguments as `FetchHandEnv`."""
         super().__init__(task, **arguments)
         physics = self.simulation.task
         assert isinstance(physics, HandReachTask)
@@ -359,17 +358,17 @@ class ManipulateEnv(RobotEnv):
         target_rotation: `z`, `parallel` or `xyz`; None for the task's own.
 
     Attributes:
-        target_position: `random` where the position counts, else `ignore`.
-        target_rotation: Which rotations goals have: `z`, `parallel` or `xyz`.
-        target_position_range: (3, 2) the box around the object in which goals lie, m.
+        target_position: `random` if the position counts, else `ignore`.
+        target_rotation: Rotations of goals: `z`, `parallel` or `xyz`.
+        target_position_range: (3, 2) limits of the goal position relative to the object, m.
         parallel_quats: The 24 rotations that map a cube to itself, wxyz.
-        ignore_z_target_rotation: Whether turns about the object's own z axis do not count.
-        randomize_initial_position: Always.
-        randomize_initial_rotation: Whether the object starts turned.
-        relative_control: Never.
+        ignore_z_target_rotation: Whether rotations about the object's own z axis do not count.
+        randomize_initial_position: Always True.
+        randomize_initial_rotation: Whether the object starts with a random rotation.
+        relative_control: Always False.
 
     Raises:
-        ValueError: If no task has such goals for this object; the message lists what is.
+        ValueError: If no task has such goals for this object; the message lists those that exist.
     """
 
     def __init__(
@@ -397,14 +396,14 @@ class ManipulateEnv(RobotEnv):
         )
 
     def compute_reward(self, achieved_goal: ArrayLike, goal: ArrayLike, info: Any = None) -> Any:
-        """As `RobotEnv`; what is sparse follows from an overridden `_is_success`, as there."""
+        """Return rewards as `RobotEnv`; sparse ones call an overridden `_is_success`."""
         if self.reward_type == 'sparse' and self.overrides('_is_success'):
             success = np.asarray(self._is_success(achieved_goal, goal), dtype=np.float32)
             return (success - np.float32(1.0))[()]
         return super().compute_reward(achieved_goal, goal, info)
 
     def _draw_goal(self, data: Any) -> None:
-        """Move the target body, on which only pictures depend."""
+        """Move the target body to the goal; it does not change the physics."""
         pose = self._shown_goal()
         geom = self._target_geom
         data.geom_xpos[geom] = pose[:3]
@@ -415,7 +414,7 @@ class ManipulateEnv(RobotEnv):
         mujoco_utils().set_joint_qvel(self.model, self.data, 'target:joint', np.zeros(6))
 
     def _shown_goal(self) -> Array:
-        """Return the goal; beside the hand, as in `manipulate.py`, if its position is ignored."""
+        """Return the goal pose to draw: beside the hand if the position is ignored."""
         goal = self.goal.copy()
         if not self.spec_of_task.position_counts:
             goal[0] += 0.15
@@ -427,7 +426,7 @@ class ManipulateEnv(RobotEnv):
 
 
 def make_env(task: str, **arguments: Any) -> RobotEnv:
-    """Makes the environment of a task as the reference has it."""
+    """Make the environment of a task with the interface of the reference."""
     spec = task_spec(task)
     if task in FETCH_CONFIGS:
         return FetchEnv(task, **arguments)
@@ -446,13 +445,13 @@ def _sites(model: mujoco.MjModel, prefix: str) -> list[int]:
 
 
 def _goal_kind(task: str) -> tuple[str, str]:
-    """Return `target_position` and `target_rotation` of the reference."""
+    """Return the reference's `target_position` and `target_rotation` for a task."""
     position = 'random' if task_spec(task).position_counts else 'ignore'
     return position, MANIPULATE_CONFIGS[task].target_rotation
 
 
 def task_with_goals(task: str, position: str | None, rotation: str | None) -> str:
-    """The task of the same object with other goals."""
+    """Return the task with the same object and this kind of goals; None keeps the task's own."""
     one_of(task, list(MANIPULATE_CONFIGS), 'task')
     own, asset = _goal_kind(task), MANIPULATE_CONFIGS[task].asset
     wanted = (position or own[0], rotation or own[1])
@@ -470,7 +469,7 @@ def task_with_goals(task: str, position: str | None, rotation: str | None) -> st
 
 
 class GymnasiumRoboticsVectorEnv(FetchHandVectorEnv):
-    """N copies of a reference's task, as a `SyncVectorEnv` of single ones shows them."""
+    """N copies of a task of the reference, with the results of a `SyncVectorEnv` of them."""
 
     def __init__(
         self,
@@ -494,7 +493,7 @@ class GymnasiumRoboticsVectorEnv(FetchHandVectorEnv):
         seed: int | Sequence[int | None] | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[Observation, dict[str, Any]]:
-        """Starts episodes; options but `reset_mask` are ignored, as the reference does."""
+        """Start episodes; options except `reset_mask` are ignored, as in the reference."""
         known = None
         if isinstance(options, dict) and 'reset_mask' in options:
             known = {'reset_mask': options['reset_mask']}
@@ -503,7 +502,7 @@ class GymnasiumRoboticsVectorEnv(FetchHandVectorEnv):
     def step(
         self, actions: NDArray[np.float32]
     ) -> tuple[Observation, Array, Flags, Flags, dict[str, Any]]:
-        """Advances as `FetchHandVectorEnv` does, with the reference's type of successes."""
+        """Advance as `FetchHandVectorEnv`; `is_success` is float32, as in the reference."""
         observation, reward, terminated, truncated, info = super().step(actions)
         for each in (info, info.get('final_info', {})):
             if 'is_success' in each:
@@ -511,12 +510,12 @@ class GymnasiumRoboticsVectorEnv(FetchHandVectorEnv):
         return observation, reward, terminated, truncated, info
 
     def compute_reward(self, achieved_goal: ArrayLike, goal: ArrayLike, info: Any = None) -> Any:
-        """Reward of goals of any batch shape: float32 if sparse, a number for a single goal."""
+        """Return rewards of goals of any batch shape: float32 if sparse, a scalar for one goal."""
         reward = super().compute_reward(achieved_goal, goal, info)[()]
         return as_reference(reward, self.reward_type)
 
     def attributes(self, name: str) -> tuple[Any, ...]:
-        """As `FetchHandVectorEnv`; also what is stated of the task, such as `initial_qpos`."""
+        """Return an attribute of every environment, also facts such as `initial_qpos`."""
         try:
             return super().attributes(name)
         except AttributeError:
@@ -526,7 +525,7 @@ class GymnasiumRoboticsVectorEnv(FetchHandVectorEnv):
 
     @cached_property
     def _single(self) -> RobotEnv:
-        """One environment, for the attributes that all have in common; made at first use."""
+        """A single environment, which has the facts that all share; made at first use."""
         return make_env(self.spec_of_task.name, control_hz=self.simulation.control_hz)
 
 

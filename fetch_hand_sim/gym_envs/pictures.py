@@ -30,7 +30,7 @@ RENDER_MODES = ['human', 'rgb_array', 'depth_array']
 
 
 class Pictures:
-    """Draws copies of a simulation; opens OpenGL or a window at the first picture.
+    """Renders copies of a simulation; opens OpenGL or a window at the first picture.
 
     An invalid size (pixels) or attribute of the camera raises ValueError, missing OpenGL or, for
     `human`, a missing display RuntimeError.
@@ -53,7 +53,7 @@ class Pictures:
         self._window: Any = None
 
     def render(self, mode: str, index: int = 0) -> Image | None:
-        """Draws one copy.
+        """Render one copy.
 
         Returns:
             `rgb_array`: (height, width, 3). `depth_array`: (height, width), metres. `human`: None.
@@ -72,7 +72,7 @@ class Pictures:
         return draw(frame)
 
     def close(self) -> None:
-        """Frees the OpenGL context and the window."""
+        """Close the OpenGL context and the window."""
         if self._renderer is not None:
             self._renderer.close()
         if self._window is not None:
@@ -80,11 +80,11 @@ class Pictures:
         self._renderer = self._window = None
 
     def __getstate__(self) -> dict[str, Any]:
-        """Without OpenGL, which belongs to this process; it opens again."""
+        """Return the state for `pickle`, without OpenGL, which the copy opens again."""
         return self.__dict__ | {'_scene': None, '_renderer': None, '_window': None}
 
     def _show(self, scene: Scene, frame: Frame) -> None:
-        """Draws into a window: Gymnasium's, with its keys."""
+        """Draw a frame in Gymnasium's window, opened at first use."""
         if self._window is None:
             self._window = _open_window(scene, *self._size)
             self._window.cam = make_camera(scene, self._camera)

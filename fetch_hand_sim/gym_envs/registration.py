@@ -1,4 +1,4 @@
-"""Registers the tasks with Gymnasium: `fetch_hand_sim/<Task>-v0`, and the reference's ids."""
+"""Register the tasks with Gymnasium: `fetch_hand_sim/<Task>-v0`, and the reference's ids."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _VECTOR_ENV = 'fetch_hand_sim.gym_envs.vector_env:FetchHandVectorEnv'
 
 
 def environment_id(task: str) -> str:
-    """The Gymnasium id of a task, for example `fetch_hand_sim/FetchPush-v0`."""
+    """Return the Gymnasium id of a task, for example `fetch_hand_sim/FetchPush-v0`."""
     return f'{NAMESPACE}/{task}-v{VERSION}'
 
 
@@ -38,7 +38,7 @@ def register_environments() -> None:
 
 
 def _register(name: str, entry_point: str, vector_entry_point: str, **arguments: str) -> None:
-    """Registers an environment of a task, single and as a batch, with arguments for both."""
+    """Register an id with a single and a vector environment and their common arguments."""
     gymnasium.register(
         name,
         entry_point=entry_point,
@@ -49,15 +49,15 @@ def _register(name: str, entry_point: str, vector_entry_point: str, **arguments:
 
 
 def make(name: str | EnvSpec, **arguments: Any) -> gymnasium.Env[Any, Any]:
-    """`gymnasium.make` with episodes as long in seconds at every rate.
+    """Call `gymnasium.make` so that episodes last as many seconds at every `control_hz`.
 
-    Gymnasium itself limits steps by what is registered, the number at 25 Hz: with `control_hz` it
-    needs `max_episode_steps` too.
+    `gymnasium.make` itself ends episodes after the number of steps for 25 Hz, unless it is given
+    `max_episode_steps`.
 
     Args:
         name: The task (`FetchPush`; `msgs_spec.tasks.TASKS` has all), the id, or `spec` of an
             environment.
-        **arguments: As `gymnasium.make` and `FetchHandEnv` have them, such as `reward_type`,
+        **arguments: Those of `gymnasium.make` and `FetchHandEnv`, such as `reward_type`,
             `render_mode` and `control_hz`.
 
     Raises:
@@ -72,7 +72,11 @@ def make(name: str | EnvSpec, **arguments: Any) -> gymnasium.Env[Any, Any]:
 
 
 def _id_of(name: str | EnvSpec) -> str | EnvSpec:
-    """Return the id of a task given by name, and other ids or specs unchanged; NameNotFound."""
+    """Replace a task name by its id; return other ids and specs unchanged.
+
+    Raises:
+        gymnasium.error.NameNotFound: If there is no such task or id.
+    """
     # A package of another task that imports this one before the tasks are known leaves it out.
     register_environments()
     if not isinstance(name, str) or '/' in name or ':' in name or name in gymnasium.registry:
@@ -90,7 +94,7 @@ def _id_of(name: str | EnvSpec) -> str | EnvSpec:
 
 
 def _with_length(name: str | EnvSpec, arguments: dict[str, Any]) -> dict[str, Any]:
-    """Arguments with as many steps per episode as fill its time, unless they say how many."""
+    """Add `max_episode_steps` for the episode's duration, unless the arguments contain it."""
     rate = arguments.get('control_hz')
     if rate is None or arguments.get('max_episode_steps') is not None:
         return arguments
@@ -118,16 +122,16 @@ def make_vec(
     wrappers: Sequence[Callable[[Any], VectorEnv[Any, Any, Any]]] | None = None,
     **arguments: Any,
 ) -> VectorEnv[Any, Any, Any]:
-    """`gymnasium.make_vec` of a batch, with wrappers, which Gymnasium itself refuses for batches.
+    """Make a vector environment as `gymnasium.make_vec`, but also with wrappers.
 
-    Episodes are as long in seconds at every rate, as those of `make`.
+    Episodes last as many seconds at every `control_hz`, as with `make`.
 
     Args:
         name: The task, the id, or `spec` of an environment.
         wrappers: Wrappers of the batch, the innermost first: those of
             `gymnasium.wrappers.vector`, or those of single environments that exist there by the
             same name.
-        **arguments: As `FetchHandVectorEnv` has them.
+        **arguments: Those of `FetchHandVectorEnv`.
 
     Raises:
         ValueError: If a wrapper is for single environments only, or an argument is not allowed.
@@ -181,7 +185,7 @@ _REFERENCE_VECTOR_ENV = 'fetch_hand_sim.gym_envs.gymnasium_robotics_env:Gymnasiu
 
 
 def register_gymnasium_robotics(override: bool = False) -> None:
-    """Registers the ids of Gymnasium-Robotics 1.4.2: `FetchPush-v4`, `HandReachDense-v3`, ...
+    """Register the ids of Gymnasium-Robotics 1.4.2: `FetchPush-v4`, `HandReachDense-v3`, ...
 
     Code written for them then runs on this package, without another change.
 
@@ -211,7 +215,7 @@ def register_gymnasium_robotics(override: bool = False) -> None:
 
 
 def reference_ids() -> dict[str, tuple[str, str]]:
-    """Task and reward type of each id of the reference that means the same physics.
+    """Return task and reward type by id, for the ids of the reference with the same physics.
 
     Its other versions (Fetch -v1, HandReach -v0, HandManipulate* -v0) need mujoco-py.
     """

@@ -20,12 +20,12 @@ from msgs_spec.text import entries
 class FetchHandVecEnv(VecEnv):
     """N copies of one task for Stable-Baselines3, stepped together on all processors.
 
-    As a `DummyVecEnv` of N single environments: an ended episode is followed by the next in the
-    same step, its last observation is `info['terminal_observation']`. Put a `VecMonitor` around it
-    for the episodes' returns.
+    It behaves as a `DummyVecEnv` of N single environments: the step that ends an episode starts
+    the next one, and `info['terminal_observation']` is the last observation. Wrap it in a
+    `VecMonitor` for the returns of episodes.
 
     Args:
-        **arguments: As `FetchHandVectorEnv` has them, but `autoreset_mode`.
+        **arguments: Those of `FetchHandVectorEnv` except `autoreset_mode`.
     """
 
     def __init__(self, task: str, num_envs: int = 1, **arguments: Any) -> None:
@@ -57,11 +57,11 @@ class FetchHandVecEnv(VecEnv):
         return observation
 
     def step_async(self, actions: NDArray[np.float32]) -> None:
-        """Takes the actions (N, action size) of the next step."""
+        """Store the actions (N, action size) for `step_wait`."""
         self._actions = actions
 
     def step_wait(self) -> VecEnvStepReturn:
-        """Steps all environments."""
+        """Step all environments with the stored actions."""
         assert self._actions is not None, 'step_async comes before step_wait'
         observation, reward, terminated, truncated, info = self.batch.step(self._actions)
         ended = terminated | truncated
@@ -79,15 +79,15 @@ class FetchHandVecEnv(VecEnv):
         return observation, reward.astype(np.float32), ended, infos
 
     def close(self) -> None:
-        """Frees the renderer."""
+        """Close the renderer."""
         self.batch.close()
 
     def get_images(self) -> Sequence[NDArray[np.uint8] | None]:
-        """Returns a picture of every environment."""
+        """Return a picture of every environment."""
         return self.batch.render() or [None] * self.num_envs
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """An attribute of the environments; methods are not called."""
+        """Return an attribute of the environments; a method is returned, not called."""
         values = self.batch.attributes(attr_name)
         return [values[i] for i in self._get_indices(indices)]
 
@@ -105,10 +105,10 @@ class FetchHandVecEnv(VecEnv):
         indices: VecEnvIndices = None,
         **method_kwargs: Any,
     ) -> list[Any]:
-        """Calls a method of the environments."""
+        """Call a method of the environments; return the results."""
         results = self.batch.call(method_name, *method_args, **method_kwargs)
         return [results[i] for i in self._get_indices(indices)]
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: VecEnvIndices = None) -> list[bool]:
-        """Nothing is around a single environment of a batch."""
+        """Return False for each: single environments of a batch have no wrappers."""
         return [False for _ in self._get_indices(indices)]

@@ -1,4 +1,4 @@
-"""The parts that one environment and a batch have in common: arguments, spaces, settings."""
+"""What the single and the vector environment share: arguments, spaces, settings."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ class TaskAttributes:
         task: One of the tasks (`msgs_spec.tasks.TASKS`).
         reward_type: `sparse` (-1 or 0) or `dense` (minus the distance).
         success_rule: `gymnasium` (released code) or `paper` (its text).
-        control_hz: Actions per simulated second: 500/n for n = 1 ... 40. With another than 25 use
-            `fetch_hand_sim.make`: Gymnasium would end episodes after the steps of 25 Hz.
+        control_hz: Actions per simulated second: 500/n for n = 1 ... 40. For other rates than 25 Hz
+            use `fetch_hand_sim.make`: Gymnasium would end episodes after the steps for 25 Hz.
         render_mode: One of `metadata['render_modes']` or None.
         width: Pixels of a picture.
         height: Pixels of a picture.
@@ -109,7 +109,7 @@ class TaskAttributes:
         super().__setattr__(name, value)
 
     def __copy__(self) -> Self:
-        """As `copy.deepcopy`: two environments have no physics or generators in common."""
+        """Return `copy.deepcopy`, so that copies share neither physics nor random generators."""
         return copy.deepcopy(self)
 
     @property
@@ -131,9 +131,9 @@ class TaskAttributes:
     def compute_reward(
         self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any = None
     ) -> Any:
-        """Reward of goals of any batch shape (..., goal size).
+        """Return rewards (...) of goals of any batch shape (..., goal size).
 
-        A subclass may have another; its steps are rewarded by it.
+        If a subclass overrides it, steps use its rewards.
         """
         return self.simulation.compute_reward(achieved_goal, desired_goal, info)
 
@@ -148,16 +148,16 @@ class TaskAttributes:
     def compute_terminated(
         self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any
     ) -> Any:
-        """Never: a reached goal is to be kept; a subclass may end episodes there."""
+        """Return False: tasks have no terminal state; a subclass may override this."""
         return False
 
     def compute_truncated(
         self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any
     ) -> Any:
-        """True if the simulation diverged at the step that returned `info`.
+        """Return True if the simulation diverged at the step that returned `info`.
 
         Returns:
-            A boolean; an array (N,) for N infos, or for those of a batch of N.
+            A boolean; an array (N,) for N infos, or for the info of a vector environment.
         """
         if info is None or isinstance(info, Mapping):
             lost = np.asarray((info or {}).get('diverged', False), dtype=bool)
@@ -226,7 +226,7 @@ class TaskAttributes:
 
 
 def observation_space(spec: TaskSpec) -> spaces.Space[Any]:
-    """`observation`, `achieved_goal` and `desired_goal`, float64, unbounded, SI units."""
+    """Return the unbounded space of `observation`, `achieved_goal`, `desired_goal`, float64."""
     sizes = {'observation': spec.observation_size}
     sizes |= dict.fromkeys(('achieved_goal', 'desired_goal'), spec.goal.size)
     return spaces.Dict(
@@ -235,13 +235,13 @@ def observation_space(spec: TaskSpec) -> spaces.Space[Any]:
 
 
 def action_space(spec: TaskSpec) -> spaces.Space[Any]:
-    """The normalised action in [-1, 1], float32."""
+    """Return the space of normalised actions in [-1, 1], float32."""
     return spaces.Box(-1.0, 1.0, shape=(spec.robot.action_size,), dtype=np.float32)
 
 
 def clip_actions(actions: NDArray[Any]) -> NDArray[Any]:
-    """Actions in [-1, 1], as Gymnasium-Robotics takes them; what is no number stays, refused later.
+    """Clip actions to [-1, 1] as Gymnasium-Robotics does; NaN stays and is rejected later.
 
-    The type stays too: the Fetch tasks scale actions in it.
+    The floating type stays, because the Fetch tasks scale actions in it.
     """
     return np.clip(actions, -1.0, 1.0) if actions.dtype.kind in 'fiu' else actions

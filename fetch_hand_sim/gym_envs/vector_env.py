@@ -30,28 +30,28 @@ _RENDER_MODES = [mode for mode in RENDER_MODES if mode != 'human']
 class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float32], Any]):
     """N copies of one task, stepped together on all processors.
 
-    It equals a `SyncVectorEnv` of N single environments bit for bit, in each of Gymnasium's modes
-    of starting again: at the next step, which ignores the action and rewards it with 0
-    (`NEXT_STEP`), in the step that ends an episode, whose last observation is `info['final_obs']`
-    (`SAME_STEP`), or by `reset_mask` only (`DISABLED`). `pickle` and `copy.deepcopy` keep the
-    state.
+    It equals a `SyncVectorEnv` of N single environments bit for bit, in each autoreset mode of
+    Gymnasium. `NEXT_STEP`: the step after the end starts the next episode, ignores the action and
+    has reward 0. `SAME_STEP`: the step that ends an episode starts the next one, and
+    `info['final_obs']` is its last observation. `DISABLED`: only `reset_mask` starts episodes.
+    `pickle` and `copy.deepcopy` keep the state.
 
-    Subclasses may bring `compute_reward`, `compute_terminated` and `compute_truncated` of
-    (achieved_goal, desired_goal, info) for all N at once: goals (N, goal size), results (N,). The
-    other methods that count in `FetchHandEnv` are refused. Arguments that are not listed here are
-    those of `TaskAttributes`; for another rate than 25 Hz use `fetch_hand_sim.make_vec`.
+    Subclasses may override `compute_reward`, `compute_terminated` and `compute_truncated` of
+    (achieved_goal, desired_goal, info) for all N at once: goals (N, goal size), results (N,).
+    Other methods that subclasses of `FetchHandEnv` may override raise TypeError. Further arguments
+    are those of `TaskAttributes`; for other rates than 25 Hz use `fetch_hand_sim.make_vec`.
 
     Args:
         task: One of the tasks (`msgs_spec.tasks.TASKS`).
         num_envs: Number of copies N.
         max_episode_steps: Steps per episode; None for the task's own number, -1 for no limit.
         num_threads: Threads that step them; 0 for all processors that the process may use.
-        autoreset_mode: When an ended episode is followed by the next.
+        autoreset_mode: When the next episode starts; see above.
         disable_env_checker: Ignored; `gymnasium.make_vec` passes it to batches too.
 
     Raises:
         ValueError: If an argument is not allowed.
-        TypeError: If a subclass has a method that would count in `FetchHandEnv` only.
+        TypeError: If a subclass overrides a method that only `FetchHandEnv` calls.
     """
 
     metadata = {  # noqa: RUF012 - as in gymnasium.vector.VectorEnv
@@ -101,15 +101,14 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
         seed: int | Sequence[int | None] | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[Observation, dict[str, Any]]:
-        """Starts episodes.
+        """Start episodes.
 
         Args:
             seed: One seed (environment i takes seed + i), one per environment, or None: the random
                 generators continue.
             options: `reset_mask`, booleans (N,): which environments start again; default all.
-                `goal`, (N, goal size) or (goal size,) for all of them: desired goals of those that
-                start, as `FetchHandEnv.reset` takes one. `variation` and `start`, likewise: one for
-                all, or a list of N with None for what is drawn.
+                `goal`, `variation` and `start` as in `FetchHandEnv.reset`: one for all, or one for
+                each of N, where None means that it is drawn.
 
         Returns:
             The observations of all environments, in the order of the space, and an empty
@@ -118,7 +117,7 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
         Raises:
             ValueError: If an option is unknown, a mask, goal or seed is invalid, or the number of
                 seeds is wrong.
-            gymnasium.error.ResetNeeded: If the mask leaves out one that was never reset.
+            gymnasium.error.ResetNeeded: If the mask leaves out an environment that was never reset.
         """
         mask = self._reset_mask(options)
         waiting = np.flatnonzero(~(mask | self.simulation.is_started))
@@ -140,23 +139,24 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
     def step(
         self, actions: NDArray[np.float32]
     ) -> tuple[Observation, Array, Flags, Flags, dict[str, Any]]:
-        """Advances every environment by one tick, or starts it again if its episode had ended.
+        """Advance every environment by one tick, or start it again if its episode had ended.
 
         Args:
-            actions: (N, action size); what lies outside [-1, 1], also infinitely far, is clipped.
+            actions: (N, action size), clipped to [-1, 1]; infinite values, too.
 
         Returns:
             Observations (N, ...), rewards (N,), terminated (N,), truncated (N,) and a dictionary.
-            Only a subclass terminates. Episodes are truncated at their end or if they diverge. The
-            dictionary has `is_success` and `diverged` (N,), masked by `_is_success` and `_diverged`
-            where an episode only started. In mode `SAME_STEP` it also has `final_obs` (N,), a
-            dictionary for each episode that ended, and `final_info`.
+            Terminated is False unless a subclass overrides it. Truncated is True at the last step
+            and if MuJoCo diverged. The dictionary has `is_success` and `diverged` (N,); the masks
+            `_is_success` and `_diverged` are False where an episode only started. In mode
+            `SAME_STEP` it also has `final_obs` (N,), a dictionary for each ended episode, and
+            `final_info`.
 
         Raises:
             ValueError: If the actions have a wrong shape, a value is NaN, or a subclass ends
                 episodes by anything but (N,) booleans.
-            gymnasium.error.ResetNeeded: If one was never reset or, in mode `DISABLED`, an
-                episode has ended.
+            gymnasium.error.ResetNeeded: If an environment was never reset or, in mode `DISABLED`,
+                its episode has ended.
         """
         started = self._ended
         if self.autoreset_mode is AutoresetMode.DISABLED and started.any():
@@ -193,11 +193,11 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
         return self.simulation.generator(index).bit_generator
 
     def _ordered(self, observation: Observation) -> Observation:
-        """An observation with its parts in the order of the space, as Gymnasium's batches."""
+        """Sort the parts of an observation as the space does, as Gymnasium's batches are."""
         return {name: observation[name] for name in sorted(observation)}
 
     def _rewards(self, result: StepResult) -> Array:
-        """Rewards (N,) of a step."""
+        """Return the rewards (N,) of a step, from `compute_reward` if it is overridden."""
         if not self.overrides('compute_reward'):
             return result.reward
         return np.asarray(self.compute_reward(*_evaluated(result)), dtype=np.float64)
@@ -235,7 +235,7 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
 
     @property  # type: ignore[misc]
     def np_random(self) -> tuple[np.random.Generator, ...]:  # type: ignore[override]
-        """The random generator of every environment, (N,), live."""
+        """The random generators of the N environments, live."""
         for index, seed in enumerate(self._seeds):
             if seed is None:
                 # A generator that is read before the first episode also draws that episode.
@@ -245,16 +245,16 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
 
     @property
     def np_random_seed(self) -> tuple[int, ...]:  # type: ignore[override]
-        """The seed of every environment's random generator, (N,); -1 before there is one."""
+        """The seeds of the N random generators; -1 where none was given."""
         return tuple(-1 if seed is None else seed for seed in self._seeds)
 
     def render(self) -> tuple[Any, ...] | None:
-        """Returns a picture of every environment; None without a render mode.
+        """Return a picture of every environment; None without a render mode.
 
         Raises:
-            RuntimeError: If there is no OpenGL, or one that draws in the thread of the first
-                picture only.
-            gymnasium.error.ResetNeeded: If one was never reset.
+            RuntimeError: If there is no OpenGL, or if another thread rendered the first picture and
+                the OpenGL backend does not allow that.
+            gymnasium.error.ResetNeeded: If an environment was never reset.
         """
         if self.render_mode is None:
             return None
@@ -263,13 +263,13 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
         return tuple(self._pictures.render(self.render_mode, i) for i in range(self.num_envs))
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
-        """Calls a method, or gives an attribute, of every environment, as `SyncVectorEnv` does.
+        """Call a method, or return an attribute, of every environment, as `SyncVectorEnv` does.
 
         Shared methods, such as `compute_reward`, are called once.
 
         Raises:
             AttributeError: If an environment has no such attribute.
-            ValueError: If it is a method for all of them only: `reset`, `step` or `close`.
+            ValueError: For `reset`, `step` and `close`, which act on all environments only.
         """
         if name in _FOR_ALL:
             raise ValueError(f'{name} is for all environments of a batch; use it directly')
@@ -281,17 +281,17 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
         return (values[0](*args, **kwargs),) * self.num_envs
 
     def attributes(self, name: str) -> tuple[Any, ...]:
-        """An attribute of every environment; of a method the method, which `get_attr` calls."""
+        """Return the attribute `name` of every environment; methods are returned, not called."""
         if name in _OF_EACH:
             return tuple(_OF_EACH[name](self))
         return (getattr(self, _SHARED.get(name, name)),) * self.num_envs
 
     def get_attr(self, name: str) -> tuple[Any, ...]:
-        """An attribute of every environment."""
+        """Return an attribute of every environment."""
         return self.call(name)
 
     def set_attr(self, name: str, values: Any) -> None:
-        """Sets an attribute of the environments: `goal` of each, or one they share.
+        """Set `goal` of each environment, or an attribute that all share.
 
         Args:
             name: `goal`, `reward_type`, `distance_threshold` or `rotation_threshold`.
@@ -319,7 +319,7 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
             setattr(self, name, each[0])
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Frees the renderer."""
+        """Close the renderer."""
         self._pictures.close()
 
     def _each_seed(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
@@ -367,16 +367,16 @@ _SHARED = {'action_space': 'single_action_space', 'observation_space': 'single_o
 
 
 def _evaluated(result: StepResult) -> tuple[Array, Array, dict[str, Any]]:
-    """Achieved and desired goals (N, goal size) of a step and its info."""
+    """Return the arguments of `compute_reward` for a step: both goals (N, goal size) and info."""
     info = {'is_success': result.success.astype(np.float64), 'diverged': result.diverged}
     return result.observation['achieved_goal'], result.observation['desired_goal'], info
 
 
 def _masked(values: Mapping[str, Any], mask: Flags) -> dict[str, Any]:
-    """Return info as Gymnasium batches it: values (N,), and masks of the environments."""
+    """Return info as Gymnasium's batches have it: values (N,), and a mask `_<name>` for each."""
     return {**values, **{f'_{name}': mask.copy() for name in values}}
 
 
 def _only(values: Mapping[str, NDArray[Any]], mask: Flags) -> dict[str, NDArray[Any]]:
-    """Values (N,) of those for whom they count; zero for the others, as Gymnasium has it."""
+    """Return the values (N,), zero where `mask` is False, as Gymnasium's batches are."""
     return {name: np.where(mask, rows, np.zeros_like(rows)) for name, rows in values.items()}

@@ -172,7 +172,7 @@ def read_start(given: Any, task: Task) -> StartState:
 
 
 def _by_joint(part: str, parts: Mapping[str, Any], task: Task) -> dict[str, float]:
-    """Return a number for each joint that is given."""
+    """Return the given numbers by joint name; ValueError for unknown joints or wrong counts."""
     joints, given = task.spec.robot.joints, parts.get(part, {})
     if not isinstance(given, Mapping):
         values = finite_numbers(f'start {part}', given, (len(joints),))

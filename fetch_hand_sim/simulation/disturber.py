@@ -116,7 +116,14 @@ class Disturber:
     # Episodes
 
     def allow(self, given: Mapping[str, Any]) -> dict[str, float]:
-        """Make requested variations possible and return them as numbers, or raise ValueError."""
+        """Check variations that a user sets for an episode and prepare the model for them.
+
+        Returns:
+            The values as numbers, by name.
+
+        Raises:
+            ValueError: If a name or value is not allowed.
+        """
         named = entries('variation', given, VARIATIONS)
         wanted = {name: _variation(name, value) for name, value in named.items()}
         for name in wanted.keys() & set(_PHYSICS):
@@ -138,7 +145,7 @@ class Disturber:
         streams: Sequence[np.random.Generator],
         given: Mapping[int, Mapping[str, float]],
     ) -> None:
-        """Begin episodes whose start state the task has set."""
+        """Draw and apply the disturbances of new episodes; the task has set their start state."""
         for index, stream in zip(ids.tolist(), streams, strict=True):
             self._streams[index] = stream
             self._draw_episode(index, stream, given.get(index, {}))
@@ -203,7 +210,7 @@ class Disturber:
     # Commands
 
     def command(self, commands: NDArray[np.floating]) -> NDArray[np.floating]:
-        """Return what reaches the motors in this tick, (N, action size), in the type given."""
+        """Delay, drop or change commands; return those that reach the motors, (N, action size)."""
         self._tick += 1
         for index in np.flatnonzero(self._tick % _BLOCK == 0).tolist():
             self._draw_block(index)
@@ -328,11 +335,11 @@ class Disturber:
     # Copies
 
     def state(self) -> dict[str, Any]:
-        """Return everything that decides the future, for `pickle` and `copy.deepcopy`."""
+        """Return the complete state, for `pickle` and `copy.deepcopy`."""
         return {name: getattr(self, name) for name in _STATE} | {'varied': self._physics.names}
 
     def set_state(self, state: Mapping[str, Any]) -> None:
-        """Continue from what `state` returned."""
+        """Restore a state that `state` returned."""
         for name in _STATE:
             setattr(self, name, state[name])
         self._is_true_current = False
@@ -373,7 +380,7 @@ class VariedPhysics:
     """Writes the variations of each simulation into its own copy of some model fields.
 
     Attributes:
-        names: The variations that are possible.
+        names: The variations that this task and its disturbances can have.
     """
 
     def __init__(self, task: Task, physics: PhysicsDisturbance) -> None:
@@ -418,7 +425,7 @@ class VariedPhysics:
         return any(len(rows) for rows in self._rows[name].values())
 
     def allow(self, name: str) -> None:
-        """Make a variation possible that is off by default, or raise ValueError."""
+        """Prepare the model for a variation that is off by default, or raise ValueError."""
         if name in self.names:
             return
         if not self._has(name):
@@ -460,7 +467,7 @@ class VariedPhysics:
         return bool(self.names)
 
     def _tilted(self, tilt: Array, direction: Array) -> Array:
-        """Return gravity (n, 3), m/s^2, for angles (n,) to the vertical and about it, rad."""
+        """Return gravity (n, 3), m/s^2, tilted by `tilt` (n,) towards `direction` (n,), rad."""
         strength = float(np.linalg.norm(self._nominal['opt.gravity']))
         across = np.sin(tilt) * strength
         return np.stack(

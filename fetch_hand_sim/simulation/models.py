@@ -195,7 +195,7 @@ def mix(model: mujoco.MjModel, first: Geoms, second: Geoms) -> dict[str, NDArray
 
 
 def _rows(flags: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return which rows (n,) of flags (n, ...) contain a True."""
+    """Reduce flags (n, ...) to (n,): whether any flag of a row is True."""
     return np.asarray(flags.any(axis=tuple(range(1, flags.ndim))))
 
 
@@ -221,11 +221,11 @@ class ListedPairs:
         self.note(model)
 
     def note(self, model: mujoco.MjModel) -> None:
-        """Accept the present geoms of a model without changing its pairs."""
+        """Store the geom parameters of a model, without changing its pairs."""
         self._geoms = {name: getattr(model, f'geom_{name}').copy() for name in _OF_GEOMS}
 
     def follow(self, model: mujoco.MjModel) -> None:
-        """Mix the parameters again of pairs whose geoms have changed."""
+        """Recompute the contact parameters of pairs whose geoms have changed since `note`."""
         changed = np.zeros(model.ngeom, dtype=np.bool_)
         for name, before in self._geoms.items():
             changed |= _rows(getattr(model, f'geom_{name}') != before)

@@ -142,7 +142,7 @@ def _has_display() -> bool:
 
 
 def start_glfw() -> bool:
-    """Return whether GLFW has a display, without its warning; raise ImportError without GLFW."""
+    """Start GLFW; return False without a display. Raise ImportError if GLFW is not installed."""
     import glfw
 
     with warnings.catch_warnings():

@@ -93,7 +93,7 @@ class SceneRenderer:
 
     @contextlib.contextmanager
     def _in_its_thread(self) -> Iterator[None]:
-        """Replace OpenGL's errors in other threads by one line."""
+        """Turn an OpenGL error of a call from another thread into a RuntimeError of one line."""
         try:
             with context_of_its_own():
                 yield

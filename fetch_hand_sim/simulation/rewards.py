@@ -110,7 +110,8 @@ class GoalMetric:
     ) -> tuple[Array, NDArray[np.bool_]]:
         """Return reward and success of goals (..., goal size), computing distances once.
 
-        Methods of subclasses are called, so steps and hindsight goals get the same rewards.
+        It calls `success` and `reward` of a subclass that overrides them, so that steps and
+        relabelled transitions get the same rewards.
         """
         if self.has_own_reward or type(self).success is not GoalMetric.success:
             reward = self.reward(achieved_goal, desired_goal)

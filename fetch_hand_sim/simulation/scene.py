@@ -220,7 +220,7 @@ class Scene:
         return Marker(shape, size, position, (red, green, blue, opacity), quaternion)
 
     def _shell(self, frame: Frame, color: Color) -> list[Marker]:
-        """Return a tinted shell around the ghost."""
+        """Return markers slightly larger than the ghost that show whether the goal is reached."""
         geom = self.model.geom(GHOST)
         pose = ghost_pose(self.spec, frame.desired_goal)
         tint = (*color[:3], 2.0 * _HALO_OPACITY)
@@ -296,7 +296,7 @@ def _capsule(start: Array, end: Array, width: float, color: Color) -> Marker:
 
 
 def _dress(mjcf: mujoco.MjSpec) -> None:
-    """Add floor, sky and shadow to the published model; hide its own goal markers."""
+    """Add floor, sky and shadow to the model of the task; hide its own goal markers."""
     for texture in mjcf.textures:
         if texture.type == mujoco.mjtTexture.mjTEXTURE_SKYBOX:
             texture.rgb1, texture.rgb2 = [0.93, 0.95, 0.97], [0.66, 0.73, 0.8]

@@ -446,7 +446,10 @@ class Simulation:
     def _each_given(
         self, name: str, given: Any, ids: NDArray[np.intp], read: Callable[[Any], _Read]
     ) -> dict[int, _Read]:
-        """Return what is given for single simulations, read and checked."""
+        """Parse the argument `name` of `reset`; return values by index of the simulation.
+
+        Simulations without a value are left out.
+        """
         pairs = zip(ids.tolist(), each_of(name, given, ids.size), strict=True)
         return {index: read(value) for index, value in pairs if value is not None}
 
@@ -560,7 +563,7 @@ class Simulation:
         return finite_numbers(name, values, shape)
 
     def _fitting(self, data: Any) -> Any:
-        """Return `data` if it belongs to a model of this size; raise `ValueError` otherwise."""
+        """Return `data`; raise ValueError if its model has other sizes than ours."""
         shape = (self.model.nq,)
         if not isinstance(data, mujoco.MjData) or data.qpos.shape != shape:
             raise ValueError(
@@ -570,7 +573,7 @@ class Simulation:
         return data
 
     def _index(self, index: int) -> int:
-        """Return `index` if a simulation has it; raise `ValueError` otherwise."""
+        """Return `index`; raise ValueError unless it is 0 ... N - 1."""
         require_whole('index', index, highest=self.num_envs - 1)
         return index
 

@@ -79,7 +79,7 @@ def _specification(spec: TaskSpec) -> Rules:
 
 
 def _model(task: Task) -> Rules:
-    """Pictures, films and /tf show the object at its free joint, and the file of the model."""
+    """Check the model: its file, and the free joint of the object, which pictures and /tf use."""
     name = task.spec.object_name
     yield (
         name is None or task.object_qpos is not None,
@@ -109,7 +109,7 @@ def _sensors(task: Task) -> Rules:
 
 
 def _formulas(task: Task) -> Rules:
-    """Formulas must work on any leading axes, row by row."""
+    """Check that formulas accept any leading axes and work row by row."""
     spec = task.spec
     rows = task.readings(spec.observed_topics)
     for topic in sensor_topics(spec):
@@ -147,7 +147,7 @@ def _rewards(simulation: Simulation) -> Rules:
 
 
 def _resets(simulation: Simulation) -> Rules:
-    """The same seed must give the same episode, and a reset must leave other simulations alone."""
+    """Check that equal seeds give equal episodes, and a reset changes no other simulation."""
     size = simulation.spec.robot.action_size
     simulation.reset(seed=[0, 1])
     first = _all_sensors(simulation)
