@@ -180,12 +180,9 @@ class Health:
                 f'slow inference: {inference["p50"]} ms, a tick is {1e3 * given.period:.1f} ms; '
                 'commands come late'
             )
+        longest = max(_SILENCE, 2.0 * min(responder.interval, _SLOWEST * self._tick_duration))
         if robots == 0:
             report.warn('no robot publishes episode_status')
-        elif age is not None and age > self._longest_silence(responder) and not given.is_paused:
+        elif age is not None and age > longest and not given.is_paused:
             report.warn(f'no state: the last one is {age:.0f} s old')
         return report
-
-    def _longest_silence(self, responder: Responder) -> float:
-        """Return the longest normal time without an observation, seconds."""
-        return max(_SILENCE, 2.0 * min(responder.interval, _SLOWEST * self._tick_duration))

@@ -222,7 +222,10 @@ class Responder:
         if self._due is not None:
             vectors, self._due, self._asked = self._due, None, None
             self._asked = self._observed(vectors)
-            self._note_arrival()
+            now = self._clock()
+            if self.received_at is not None:
+                self.interval = now - self.received_at
+            self.received_at = now
         elif self._asked is None or self._clock() < self._ask_again_at:
             return
         self._forget_last_episode()
@@ -255,12 +258,6 @@ class Responder:
             # Formulas of third-party tasks may raise anything.
             self.unusable += 1
             raise ValueError(f'no observation: {one_line(error)}') from None
-
-    def _note_arrival(self) -> None:
-        now = self._clock()
-        if self.received_at is not None:
-            self.interval = now - self.received_at
-        self.received_at = now
 
     def _command(self, observation: Vectors) -> NDArray[np.float64]:
         """Return the command (action size,), in command units."""

@@ -43,14 +43,6 @@ def _factors(*names: str) -> Callable[[float], dict[str, Any]]:
     return lambda level: {'physics': {name: [1.0 / level, level] for name in names}}
 
 
-def _object_noise(level: float) -> dict[str, Any]:
-    return {'object': {'noise': level, 'rotation_noise': min(5.0 * level, 0.5)}}
-
-
-def _pushes(level: float) -> dict[str, Any]:
-    return {'pushes': {'force': level, 'rate': 1.0}}
-
-
 _TICKS = (1.0, 2.0, 3.0, 4.0)
 _SPREADS = (1.1, 1.25, 1.5, 2.0, 3.0)
 SWEEPS = (
@@ -64,12 +56,17 @@ SWEEPS = (
         'object noise',
         'm, 5 x rad',
         (0.002, 0.005, 0.01, 0.02, 0.05),
-        _object_noise,
+        lambda level: {'object': {'noise': level, 'rotation_noise': min(5.0 * level, 0.5)}},
         needs_object=True,
     ),
     Sweep('friction', 'factor', _SPREADS, _factors('friction')),
     Sweep('actuators', 'factor', _SPREADS, _factors('gain', 'damping')),
-    Sweep('pushes', 'of the weight, 1 Hz', (0.25, 0.5, 1.0, 2.0, 4.0), _pushes),
+    Sweep(
+        'pushes',
+        'of the weight, 1 Hz',
+        (0.25, 0.5, 1.0, 2.0, 4.0),
+        lambda level: {'pushes': {'force': level, 'rate': 1.0}},
+    ),
 )
 
 

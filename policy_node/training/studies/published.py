@@ -118,11 +118,13 @@ def _table(head: str, actors: Path, row: Callable[[str, dict[str, Any]], list[st
 
 
 def _row(task: str, report: dict[str, Any]) -> list[str]:
+    lower, upper = report['success_gymnasium_interval_95']
+    reference = report.get('reference')
     return [
         task,
-        _success(report),
+        f'**{report["success_gymnasium"]:.3f}** ({lower:.3f} ... {upper:.3f})',
         f'{CEILINGS[task]:.3f}' if task in CEILINGS else '',
-        _in_reference(report),
+        f'{reference["success"]:.3f} of {reference["episodes"]:,}' if reference else '',
         f'{report["touched"]:.3f}',
         f'{report["mean_return"]:.2f}',
         f'{report["episodes"]:,}',
@@ -141,14 +143,3 @@ def _short_row(task: str, report: dict[str, Any]) -> list[str]:
         f'{reference["success"]:.3f}' if reference else '',
         BEST[task].success if task in BEST else '',
     ]
-
-
-def _success(report: dict[str, Any]) -> str:
-    lower, upper = report['success_gymnasium_interval_95']
-    return f'**{report["success_gymnasium"]:.3f}** ({lower:.3f} ... {upper:.3f})'
-
-
-def _in_reference(report: dict[str, Any]) -> str:
-    """Return the success rate in Gymnasium-Robotics, if it was measured."""
-    reference = report.get('reference')
-    return f'{reference["success"]:.3f} of {reference["episodes"]:,}' if reference else ''
