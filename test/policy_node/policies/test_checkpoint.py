@@ -16,39 +16,17 @@ import torch
 from safetensors import safe_open
 from safetensors.numpy import save_file
 
-from msgs_spec.tasks import task_spec
 from policy_node.policies import checkpoint
 from policy_node.policies.actor import Actor
-from policy_node.policies.checkpoint import ActorInfo
 from policy_node.policies.files import read_tensors
-
-
-def make_info(task: str = 'FetchPush', **changes: Any) -> ActorInfo:
-    spec = task_spec(task)
-    info = ActorInfo(
-        task=task,
-        observation_layout=checkpoint.observation_layout(spec),
-        goal_size=spec.goal.size,
-        action_size=spec.robot.action_size,
-        hidden_sizes=(8, 8),
-        layer_norm=True,
-        control_hz=25.0,
-        seed=7,
-        command="fetch_hand_sim train --task FetchPush --set 'hidden_sizes=8,8'",
-        source_revision='abc',
-        env_steps=1000,
-        config={'gamma': 0.98},
-        success={'last_step': 0.5},
-    )
-    return replace(info, **changes)
+from policy_node.policies.network_shape import NetworkShape
+from support.fresh_actor import fresh_actor
 
 
 @pytest.fixture
 def saved(tmp_path: Path) -> Path:
-    torch.manual_seed(0)
-    info = make_info()
     path = tmp_path / 'actor.safetensors'
-    checkpoint.save(path, Actor(info.shape), info)
+    fresh_actor(path, 'FetchPush', hidden_sizes=(8, 8), layer_norm=True)
     return path
 
 
@@ -60,13 +38,19 @@ def rewrite(path: Path, tensors: dict[str, Any] | None = None, **metadata: str) 
 
 
 def test_round_trip_keeps_every_bit(tmp_path: Path) -> None:
-    info = make_info()
-    actor = Actor(info.shape)
-    actor.observation_normalizer.mean.uniform_()
     path = tmp_path / 'a.safetensors'
-    checkpoint.save(path, actor, info)
-    loaded, loaded_info = checkpoint.load(path, task='FetchPush')
-    assert loaded_info == info == checkpoint.read_info(path)
+    fields: dict[str, Any] = {
+        'seed': 7,
+        'hidden_sizes': (8, 8),
+        'command': "fetch_hand_sim train --task FetchPush --set 'hidden_sizes=8,8'",
+        'source_revision': 'abc',
+        'env_steps': 1000,
+        'config': {'gamma': 0.98},
+        'success': {'last_step': 0.5},
+    }
+    actor = fresh_actor(path, 'FetchPush', **fields)
+    loaded, info = checkpoint.load(path, task='FetchPush')
+    assert info == replace(checkpoint.read_info(path), **fields)
     assert loaded.state_dict().keys() == actor.state_dict().keys()
     for name, value in actor.state_dict().items():
         assert torch.equal(loaded.state_dict()[name], value), name
@@ -190,6 +174,6 @@ def test_crafted_headers_are_refused_in_one_line(tmp_path: Path, header: bytes, 
 def test_names_and_shapes_of_tensors_are_those_of_the_actor(
     hidden_sizes: tuple[int, ...], layer_norm: bool
 ) -> None:
-    shape = make_info(hidden_sizes=hidden_sizes, layer_norm=layer_norm).shape
+    shape = NetworkShape(25, 3, 4, hidden_sizes, layer_norm)
     state = Actor(shape).state_dict()
     assert {name: tuple(value.shape) for name, value in state.items()} == shape.tensor_shapes()
