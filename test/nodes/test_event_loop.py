@@ -8,32 +8,30 @@ import time
 from collections.abc import Callable
 
 import pytest
+from rclpy.clock_type import ClockType
+from rclpy.publisher import Publisher
 from std_msgs.msg import Float64
 
 from node_runtime.event_loop import EventLoop
+from node_runtime.ros import seldom
+from support import wait_until
 
 
-def collect(node) -> tuple[list[float], object]:
-    received: list[float] = []
-    node.create_subscription(Float64, 'numbers', lambda m: received.append(m.data), 10)
+def connected_publisher(node, callback: Callable[[Float64], None]) -> Publisher:
+    node.create_subscription(Float64, 'numbers', callback, 10)
     publisher = node.create_publisher(Float64, 'numbers', 10)
-    deadline = time.monotonic() + 10.0
-    while not publisher.get_subscription_count():
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
-    return received, publisher
+    wait_until(publisher.get_subscription_count, 'subscription')
+    return publisher
 
 
-def serve_until(loop: EventLoop, condition: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + 10.0
-    while not condition():
-        assert time.monotonic() < deadline
-        loop.serve_pending(100)
-        loop.wait(0.01)
-
-
-def test_no_more_than_the_limit_is_served_at_once(node):
-    received, publisher = collect(node)
+@pytest.mark.parametrize('has_events_executor', [True, False])
+def test_messages_are_served_in_order_and_no_more_than_the_limit_at_once(
+    node, has_events_executor, monkeypatch
+):
+    if not has_events_executor:
+        monkeypatch.setitem(sys.modules, 'rclpy.experimental.events_executor', None)
+    received: list[float] = []
+    publisher = connected_publisher(node, lambda message: received.append(message.data))
     loop = EventLoop(node)
     loop.wait(0.1)
     loop.wait(0.1)
@@ -42,7 +40,13 @@ def test_no_more_than_the_limit_is_served_at_once(node):
     time.sleep(0.2)
     loop.serve_pending(5)
     assert len(received) <= 5
-    serve_until(loop, lambda: len(received) == 8)
+
+    def all_served():
+        loop.serve_pending(100)
+        loop.wait(0.01)
+        return len(received) == 8
+
+    wait_until(all_served, 'rest')
     assert received == [float(number) for number in range(8)]
     loop.close()
 
@@ -57,21 +61,10 @@ def test_wait_ends_in_time_without_anything_to_serve(node):
     loop.close()
 
 
-def test_older_rclpy_without_events_executor(node, monkeypatch):
-    monkeypatch.setitem(sys.modules, 'rclpy.experimental.events_executor', None)
-    received, publisher = collect(node)
-    loop = EventLoop(node)
-    publisher.publish(Float64(data=7.0))
-    serve_until(loop, lambda: len(received) == 1)
-    for number in range(5):
-        publisher.publish(Float64(data=float(number)))
-    serve_until(loop, lambda: len(received) == 6)
-    assert received == [7.0, 0.0, 1.0, 2.0, 3.0, 4.0]
-    loop.close()
-
-
 SUSPENDED = """
 import rclpy
+from rclpy.clock_type import ClockType
+from rclpy.publisher import Publisher
 from std_msgs.msg import Float64
 from node_runtime import event_loop
 event_loop._SUSPENDED = 1.0
@@ -102,11 +95,8 @@ def test_a_node_keeps_its_name_after_a_suspension(node, start_process, tmp_path,
     process = start_process(sys.executable, '-c', SUSPENDED)
 
     def wait_for_names(expected):
-        deadline, names = time.monotonic() + 20.0, None
-        while names != expected:
-            assert time.monotonic() < deadline, names
-            time.sleep(0.1)
-            names = [each.node_name for each in node.get_publishers_info_by_topic('/numbers')]
+        publishers = node.get_publishers_info_by_topic
+        wait_until(lambda: [p.node_name for p in publishers('/numbers')] == expected, expected)
 
     wait_for_names(['suspended'])
     process.send_signal(signal.SIGSTOP)
@@ -117,19 +107,20 @@ def test_a_node_keeps_its_name_after_a_suspension(node, start_process, tmp_path,
 
 
 def test_an_error_in_a_callback_is_not_swallowed(node):
-    loop = EventLoop(node)
-    publisher = node.create_publisher(Float64, 'numbers', 10)
-
     def fail(message):
         raise RuntimeError('from the callback')
 
-    node.create_subscription(Float64, 'numbers', fail, 10)
-    deadline = time.monotonic() + 10.0
-    while not publisher.get_subscription_count():
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
-    publisher.publish(Float64())
+    loop = EventLoop(node)
+    connected_publisher(node, fail).publish(Float64())
     with pytest.raises(RuntimeError, match='from the callback'):
-        while time.monotonic() < deadline:
-            loop.wait(0.05)
+        wait_until(lambda: loop.wait(0.05), 'error')
     loop.close()
+
+
+def test_a_line_is_throttled_by_the_steady_clock(node):
+    assert seldom(0.5)['throttle_time_source_type'].clock_type is ClockType.STEADY_TIME
+    said = []
+    for pause in (0.0, 0.0, 0.6):
+        time.sleep(pause)
+        said.append(node.get_logger().warning('line', **seldom(0.5)))
+    assert said == [True, False, True]

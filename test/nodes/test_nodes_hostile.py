@@ -19,10 +19,10 @@ from std_msgs.msg import Float64MultiArray
 from msgs_spec.codecs import TopicCodec, message_stamp
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ, task_spec
 from msgs_spec.topics import topic, topics
+from support import wait_until
 from support.graph import (
     POLICY_NODE,
     SIM_NODE,
-    TIMEOUT,
     Start,
     client,
     end,
@@ -268,15 +268,11 @@ def test_memory_stays_flat_at_twenty_times_real_time(
         end(process)
 
 
-def wait_for_handler(process: subprocess.Popen[str]) -> None:
-    """Waits until a process catches SIGTERM: Python itself catches SIGINT from its start."""
-    deadline = time.monotonic() + TIMEOUT
-    while time.monotonic() < deadline and process.poll() is None:
-        status = Path(f'/proc/{process.pid}/status').read_text()
-        if int(re.search(r'SigCgt:\s+(\w+)', status)[1], 16) >> (signal.SIGTERM - 1) & 1:
-            return
-        time.sleep(0.001)
-    raise AssertionError('no signal handler')
+def has_handler(process: subprocess.Popen[str]) -> bool:
+    """Return whether a process catches SIGTERM: Python itself catches SIGINT from its start."""
+    assert process.poll() is None
+    status = Path(f'/proc/{process.pid}/status').read_text()
+    return bool(int(re.search(r'SigCgt:\s+(\w+)', status)[1], 16) >> (signal.SIGTERM - 1) & 1)
 
 
 @pytest.mark.parametrize(
@@ -293,7 +289,7 @@ def test_ctrl_c_at_any_moment_ends_with_0_and_no_traceback(
     for group in (delays[::2], delays[1::2]):
         processes = [start_process(*command, *arguments) for _ in group]
         for process in processes:
-            wait_for_handler(process)
+            wait_until(lambda: has_handler(process), 'signal handler')  # noqa: B023
         began = time.monotonic()
         for process, delay in zip(processes, group, strict=True):
             time.sleep(max(0.0, began + delay - time.monotonic()))

@@ -5,44 +5,21 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
 
 from msgs_spec.tasks import task_spec
-from support.graph import SIM_NODE, client, finish, ros_args
+from support import is_running, running_processes, stat_of, wait_until
+from support.graph import SIM_NODE, Start, client, finish, ros_args
 
-Start = Callable[..., subprocess.Popen[str]]
 REACH = task_spec('FetchReach')
 VIEW = (sys.executable, '-m', 'fetch_hand_sim.view', '--no-browser')
-PATIENCE = 30.0
-
-
-def stat_of(process: int) -> list[str]:
-    """State, parent and what follows of a process; empty if it is gone."""
-    try:
-        return Path(f'/proc/{process}/stat').read_text().rpartition(')')[2].split()
-    except OSError:
-        return []
-
-
-def is_running(process: int) -> bool:
-    return stat_of(process)[:1] not in ([], ['Z'])
 
 
 def children_of(parent: int) -> list[int]:
-    processes = [int(path.name) for path in Path('/proc').glob('[0-9]*')]
-    return [process for process in processes if stat_of(process)[1:2] == [str(parent)]]
-
-
-def wait_until(condition: Callable[[], bool], what: str) -> None:
-    end = time.monotonic() + PATIENCE
-    while not condition():
-        assert time.monotonic() < end, f'no {what}'
-        time.sleep(0.05)
+    return [each for each in running_processes() if stat_of(each)[1:2] == [str(parent)]]
 
 
 def start_view(start_process: Start, *arguments: str) -> tuple[subprocess.Popen[str], list[str]]:

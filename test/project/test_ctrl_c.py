@@ -72,18 +72,15 @@ def test_the_names_of_executables_are_known():
     assert frozenset(console_scripts()) == EXECUTABLES
 
 
-@pytest.mark.parametrize('name', sorted(EXECUTABLES))
-def test_a_program_that_has_hardly_begun(name, programs):
-    assert interrupt_in_time([programs / name], 1) == (130, f'{name}: stopping\n')
+# Modules share the code of programs; these import least and most.
+MODULES = ('fetch_hand_sim', 'fetch_hand_sim.sim_node', 'policy_node.training.train_her')
 
 
-# They share the code; these import least and most.
-@pytest.mark.parametrize(
-    'module', ['fetch_hand_sim', 'fetch_hand_sim.sim_node', 'policy_node.training.train_her']
-)
-def test_a_module_that_has_hardly_begun(module):
-    name = module.rpartition('.')[2]
-    assert interrupt_in_time(['-m', module], 1) == (130, f'{name}: stopping\n')
+@pytest.mark.parametrize('started', [*sorted(EXECUTABLES), *(f'-m {name}' for name in MODULES)])
+def test_a_program_or_module_that_has_hardly_begun(started, programs):
+    command = started.split() if started.startswith('-m') else [programs / started]
+    name = started.rpartition(' ')[2].rpartition('.')[2]
+    assert interrupt_in_time(command, 1) == (130, f'{name}: stopping\n')
 
 
 @pytest.mark.parametrize(

@@ -62,15 +62,18 @@ def parameters_of(node: str, **arguments: str) -> dict[str, object]:
         rclpy.shutdown()
 
 
-def test_without_arguments_the_demo_runs():
-    values = parameters_of('sim_node')
-    assert (values['task'], values['episodes'], values['episode_dir']) == (
-        'FetchReach',
-        5,
-        'episodes',
-    )
-    assert values['wait_for_commands'] is True
-    assert parameters_of('policy_node') == {spec.name: spec.default for spec in POLICY_NODE}
+def test_without_arguments_the_demo_and_the_robot_for_the_page_wait_for_commands():
+    for arguments, wanted in (
+        ({}, ('FetchReach', 5, 'episodes')),
+        (given_by_view(), ('HandManipulateBlockRotateZ', 0, '')),
+    ):
+        values = parameters_of('sim_node', **arguments)
+        assert (values['task'], values['episodes'], values['episode_dir']) == wanted
+        assert values['wait_for_commands'] is True
+        policy = parameters_of('policy_node', **arguments)
+        assert policy == {spec.name: spec.default for spec in POLICY_NODE}
+    logged = parameters_of('sim_node', **given_by_view(episode_dir='there'))
+    assert logged['episode_dir'] == 'there'
 
 
 def test_arguments_that_are_not_given_leave_a_params_file_as_it_is(tmp_path):
@@ -152,19 +155,6 @@ def test_a_launched_page_is_local_and_may_command_by_default():
     assert all(arg.get('description') for arg in VIEW_LAUNCH.findall('arg'))
 
 
-def test_a_robot_for_the_page_runs_forever_and_is_not_logged():
-    values = parameters_of('sim_node', **given_by_view())
-    assert (values['task'], values['episodes'], values['episode_dir']) == (
-        'HandManipulateBlockRotateZ',
-        0,
-        '',
-    )
-    assert values['wait_for_commands'] is True
-    assert parameters_of('policy_node', **given_by_view())['task'] == ''
-    logged = parameters_of('sim_node', **given_by_view(episode_dir='there'))
-    assert logged['episode_dir'] == 'there'
-
-
 def test_a_params_file_changes_only_its_own_parameters(tmp_path):
     path = tmp_path / 'my.yaml'
     path.write_text(yaml.safe_dump({'/**/sim_node': {'ros__parameters': {'task': 'FetchPush'}}}))
@@ -176,20 +166,16 @@ def test_a_params_file_changes_only_its_own_parameters(tmp_path):
 
 
 @pytest.mark.parametrize('node', SPECS)
-def test_parameter_file_holds_the_defaults(node):
+def test_the_parameter_file_contains_the_defaults_and_that_of_the_demo_others(node):
     nodes = yaml.safe_load((ROOT / 'config' / 'sim_node.yaml').read_text())
     given = nodes[f'/**/{node}']['ros__parameters']
     wanted = {spec.name: spec.default for spec in SPECS[node]}
-    assert given == wanted
-    assert {name: type(value) for name, value in given.items()} == {
-        name: type(value) for name, value in wanted.items()
-    }
-
-
-def test_the_parameter_file_of_the_demo_is_valid():
-    nodes = yaml.safe_load((ROOT / 'config' / 'demo.yaml').read_text())
-    specs = {spec.name: spec for spec in SIM_NODE}
-    for name, value in nodes['/**/sim_node']['ros__parameters'].items():
+    assert [(name, type(value), value) for name, value in sorted(given.items())] == [
+        (name, type(value), value) for name, value in sorted(wanted.items())
+    ]
+    demo = yaml.safe_load((ROOT / 'config' / 'demo.yaml').read_text()).get(f'/**/{node}', {})
+    specs = {spec.name: spec for spec in SPECS[node]}
+    for name, value in demo.get('ros__parameters', {}).items():
         validate(specs[name], value)
         assert value != specs[name].default
 

@@ -19,6 +19,7 @@ from support import ROOT
 
 PACKAGES = ('msgs_spec', 'node_runtime', 'fetch_hand_sim', 'policy_node')
 TRAINING = 'policy_node.training'
+RESEARCH = f'{TRAINING}.research'
 
 ABOVE_RUNTIME = ('fetch_hand_sim', 'policy_node', 'mujoco', 'gymnasium', 'torch', 'safetensors')
 # Packages that modules may not import, even in functions; the innermost key applies.
@@ -27,10 +28,13 @@ FORBIDDEN = {
     'node_runtime': ABOVE_RUNTIME,
     'fetch_hand_sim': ('policy_node', 'torch', 'safetensors'),
     # Its table names the modules of all commands and imports none of them.
-    'fetch_hand_sim.__main__': ('torch', 'safetensors'),
+    'fetch_hand_sim.__main__': ('torch', 'safetensors', RESEARCH),
     'policy_node': ('fetch_hand_sim', TRAINING, 'mujoco', 'gymnasium', 'gymnasium_robotics'),
-    TRAINING: (),
+    TRAINING: (RESEARCH,),
+    RESEARCH: (),
 }
+# Part of a forbidden package that every module of the training may import.
+REGISTRY = f'{RESEARCH}.registry'
 # The shells on the ROS graph; all else runs without ROS.
 NODES = (
     'fetch_hand_sim.replay_node',
@@ -137,10 +141,13 @@ def imports(source: str, package: str) -> Iterator[Import]:
     return visit(ast.parse(source), nested=False)
 
 
-def forbidden(module: str) -> tuple[str, ...]:
-    """Return the packages that `module` may not import."""
+def is_forbidden(module: str, imported: str) -> bool:
     layer = max((name for name in FORBIDDEN if is_within(module, name)), key=len)
-    return FORBIDDEN[layer]
+    # `from policy_node.training.research import registry` counts as the package, too.
+    allowed = imported == RESEARCH or is_within(imported, REGISTRY)
+    if is_within(module, TRAINING) and allowed:
+        return False
+    return any(is_within(imported, name) for name in FORBIDDEN[layer])
 
 
 def violations(source: str, module: str, package: str) -> list[str]:
@@ -148,7 +155,7 @@ def violations(source: str, module: str, package: str) -> list[str]:
     return [
         f'{module}:{found.line} imports {found.module}'
         for found in imports(source, package)
-        if any(is_within(found.module, name) for name in forbidden(module))
+        if is_forbidden(module, found.module)
     ]
 
 
@@ -296,56 +303,33 @@ def test_ros_in_a_node_is_found(node):
     assert any(ros_at_import(path.read_text(), _package(path)) for path in sources)
 
 
-RESEARCH = f'{TRAINING}.research'
-
-
-def research_imports(source: str, module: str, package: str) -> list[str]:
-    """Return the research modules, other than their registry, that a module of the core imports."""
-    names = (found.module for found in imports(source, package))
-    inside = (name for name in names if is_within(name, RESEARCH) and name != RESEARCH)
-    allowed = f'{RESEARCH}.registry'
-    return [f'{module} imports {name}' for name in inside if not is_within(name, allowed)]
-
-
-def test_the_core_of_the_training_imports_only_the_registry_of_the_research() -> None:
-    core = [path for path in SOURCES if not is_within(module_name(path), RESEARCH)]
-    found = (research_imports(p.read_text(), module_name(p), _package(p)) for p in core)
-    assert list(chain.from_iterable(found)) == []
-    assert research_imports(f'from {RESEARCH}.ppo import PPO', 'one', 'two')
-    assert not research_imports(f'from {RESEARCH}.registry import make_learner', 'one', 'two')
+REWARDS, DEMO = 'fetch_hand_sim.simulation.rewards', 'fetch_hand_sim.commands.demo'
 
 
 @pytest.mark.parametrize(
-    ('module', 'source'),
+    ('module', 'source', 'is_allowed'),
     [
-        ('msgs_spec.topics', 'import mujoco'),
-        ('msgs_spec.topics', 'from ..policy_node import actor'),
-        ('fetch_hand_sim.simulation.rewards', 'def reward():\n    from torch import nn'),
-        ('fetch_hand_sim.simulation.rewards', 'if TYPE_CHECKING:\n    import torch'),
-        ('fetch_hand_sim.simulation.rewards', "import importlib\nimportlib.import_module('torch')"),
-        ('policy_node.node', 'from .training import replay'),
-        ('fetch_hand_sim.commands.demo', "util.find_spec('policy_node')"),
-        ('fetch_hand_sim.commands.demo', "f'{sys.executable} -m policy_node.node --ros-args'"),
+        ('msgs_spec.topics', 'import mujoco', False),
+        ('msgs_spec.topics', 'from ..policy_node import actor', False),
+        ('msgs_spec.topics', 'def profile():\n    from rclpy.qos import QoSProfile', True),
+        (REWARDS, 'def reward():\n    from torch import nn', False),
+        (REWARDS, 'if TYPE_CHECKING:\n    import torch', False),
+        (REWARDS, "import importlib\nimportlib.import_module('torch')", False),
+        (REWARDS, 'import mujoco\nfrom msgs_spec.tasks import TASKS', True),
+        (REWARDS, 'import torchless', True),
+        ('policy_node.node', 'from .training import replay', False),
+        (f'{TRAINING}.train_her', 'from . import replay', True),
+        (f'{TRAINING}.train_her', f'from {RESEARCH}.ppo import PPO', False),
+        (f'{TRAINING}.train_her', f'from {RESEARCH}.registry import make_learner', True),
+        (DEMO, "util.find_spec('policy_node')", False),
+        (DEMO, "f'{sys.executable} -m policy_node.node --ros-args'", False),
+        (DEMO, "executable('policy_node')", True),
+        (DEMO, "entry_points(group='fetch_hand_sim.actors')", True),
+        (DEMO, '"""Starts `policy_node.node` by its entry point."""', True),
     ],
 )
-def test_a_forbidden_import_is_found(module, source):
-    assert violations(source, module, module.rpartition('.')[0])
-
-
-@pytest.mark.parametrize(
-    ('module', 'source'),
-    [
-        ('msgs_spec.topics', 'def profile():\n    from rclpy.qos import QoSProfile'),
-        ('fetch_hand_sim.simulation.rewards', 'import mujoco\nfrom msgs_spec.tasks import TASKS'),
-        ('fetch_hand_sim.simulation.rewards', 'import torchless'),
-        ('policy_node.training.train_her', 'from . import replay'),
-        ('fetch_hand_sim.commands.demo', "executable('policy_node')"),
-        ('fetch_hand_sim.commands.demo', "entry_points(group='fetch_hand_sim.actors')"),
-        ('fetch_hand_sim.commands.demo', '"""Starts `policy_node.node` by its entry point."""'),
-    ],
-)
-def test_an_allowed_import_is_not(module, source):
-    assert violations(source, module, module.rpartition('.')[0]) == []
+def test_forbidden_imports_are_found_and_allowed_ones_are_not(module, source, is_allowed):
+    assert (violations(source, module, module.rpartition('.')[0]) == []) == is_allowed
 
 
 def _loaded_by(modules: list[str]) -> set[str]:
@@ -368,26 +352,27 @@ def _modules_of(package: str) -> list[str]:
     return [name for name in names if is_within(name, package)]
 
 
-def test_importing_the_contract_loads_no_simulator_network_or_ros():
-    loaded = _loaded_by(_modules_of('msgs_spec'))
-    assert 'msgs_spec' in loaded
-    assert loaded.isdisjoint(
-        {'node_runtime', 'fetch_hand_sim', 'policy_node', 'mujoco', 'gymnasium', 'torch', 'rclpy'}
-    )
+SIMULATION = {'fetch_hand_sim', 'mujoco', 'gymnasium'}
 
 
-def test_importing_the_robots_loads_no_torch():
-    # The adapter for Stable-Baselines3 is for those who have it.
-    modules = set(_modules_of('fetch_hand_sim')) - {'fetch_hand_sim.gym_envs.stable_baselines3'}
-    loaded = _loaded_by(sorted(modules))
-    assert {'fetch_hand_sim', 'msgs_spec', 'mujoco'} <= loaded
-    assert loaded.isdisjoint({'policy_node', 'torch'})
-
-
-def test_importing_the_actor_loads_no_simulation():
-    outside_training = [
-        name for name in _modules_of('policy_node') if not is_within(name, TRAINING)
+@pytest.mark.parametrize(
+    ('package', 'without', 'expected', 'absent'),
+    [
+        ('msgs_spec', (), set(), {'node_runtime', 'policy_node', 'torch', 'rclpy', *SIMULATION}),
+        # The adapter for Stable-Baselines3 is for those who have it.
+        (
+            'fetch_hand_sim',
+            ('fetch_hand_sim.gym_envs.stable_baselines3',),
+            {'msgs_spec', 'mujoco'},
+            {'policy_node', 'torch'},
+        ),
+        ('policy_node', (TRAINING,), {'torch'}, SIMULATION),
+    ],
+)
+def test_importing_a_package_loads_nothing_of_other_layers(package, without, expected, absent):
+    modules = [
+        name for name in _modules_of(package) if not any(is_within(name, each) for each in without)
     ]
-    loaded = _loaded_by(outside_training)
-    assert {'policy_node', 'torch'} <= loaded
-    assert loaded.isdisjoint({'fetch_hand_sim', 'mujoco', 'gymnasium'})
+    loaded = _loaded_by(modules)
+    assert {package, *expected} <= loaded
+    assert loaded.isdisjoint(absent)

@@ -7,13 +7,11 @@ import signal
 import socket
 import subprocess
 import sys
-import time
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from support import ROOT, script_environment
+from support import ROOT, is_running, script_environment, wait_until
 from support.run_guard import DOMAIN_LOCK_PORT, processes_of
 
 # A test that starts a demo, which starts nodes in sessions of their own.
@@ -26,14 +24,6 @@ def test_for_ever(start_process):
     print(os.environ['ROS_DOMAIN_ID'], os.environ['ROS_LOG_DIR'], flush=True)
     time.sleep(600)
 """
-TIMEOUT = 30.0
-
-
-def wait_until(condition: Callable[[], bool], what: str) -> None:
-    end = time.monotonic() + TIMEOUT
-    while not condition():
-        assert time.monotonic() < end, f'{what} after {TIMEOUT} s'
-        time.sleep(0.05)
 
 
 def is_reserved(domain: int) -> bool:
@@ -43,14 +33,6 @@ def is_reserved(domain: int) -> bool:
         except OSError:
             return True
     return False
-
-
-def is_running(process: int) -> bool:
-    try:
-        state = Path(f'/proc/{process}/stat').read_text().rpartition(')')[2].split()[0]
-    except OSError:
-        return False
-    return state != 'Z'
 
 
 @pytest.mark.release
@@ -70,12 +52,12 @@ def test_a_killed_run_takes_its_nodes_along(tmp_path):
         words = run.stdout.readline().split()
         domain, log_directory = int(words[0]), words[1]
         # The demo, the robot and its policy.
-        wait_until(lambda: len(processes_of(log_directory)) >= 3, 'too few processes')
+        wait_until(lambda: len(processes_of(log_directory)) >= 3, 'demo with its nodes')
         started = processes_of(log_directory)
         assert is_reserved(domain)
     finally:
         run.send_signal(signal.SIGKILL)
         run.communicate()
-    wait_until(lambda: not any(is_running(process) for process in started), 'a node left')
-    wait_until(lambda: not is_reserved(domain), 'a domain still reserved')
-    wait_until(lambda: not Path(log_directory).exists(), 'a folder of logs left')
+    wait_until(lambda: not any(is_running(process) for process in started), 'end of the nodes')
+    wait_until(lambda: not is_reserved(domain), 'free domain')
+    wait_until(lambda: not Path(log_directory).exists(), 'end of the folder of logs')

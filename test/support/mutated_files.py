@@ -21,12 +21,14 @@ import time
 import zlib
 from collections import Counter
 from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import replace
 from io import StringIO
 from pathlib import Path
 
 import lz4.frame
 import numpy as np
 import zstandard
+from mcap.data_stream import RecordBuilder
 from mcap.records import Chunk
 from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
@@ -154,7 +156,10 @@ class Mutator:
                     self.random.integers(8)
                 )
             end = offset + 9 + struct.unpack_from('<Q', self.whole, offset + 1)[0]
-            data += self.whole[position:offset] + _chunk_record(chunk, bytes(content))
+            packed = lz4.frame.compress(bytes(content))
+            sizes = {'uncompressed_crc': zlib.crc32(content), 'uncompressed_size': len(content)}
+            changed = replace(chunk, compression='lz4', data=packed, **sizes)
+            data += self.whole[position:offset] + _chunk_record(changed)
             position = end
         return bytes(data + self.whole[position:])
 
@@ -168,7 +173,7 @@ class Mutator:
         else:
             packed, name = lz4.frame.compress(zeros), 'lz4'
         chunk = Chunk(name, packed, 0, 0, 0, told)
-        record = _raw_chunk(chunk) * int(self.random.integers(1, 30))
+        record = _chunk_record(chunk) * int(self.random.integers(1, 30))
         offset = next(offset for offset, _ in _chunks(self.whole, self.records))
         return self.whole[:offset] + record + self.whole[offset:]
 
@@ -191,31 +196,10 @@ def _chunks(data: bytes, offsets: list[int]) -> list[tuple[int, Chunk]]:
     return list(zip(found, chunks, strict=True))
 
 
-def _chunk_record(chunk: Chunk, content: bytes) -> bytes:
-    return _raw_chunk(
-        Chunk(
-            'lz4',
-            lz4.frame.compress(content),
-            chunk.message_end_time,
-            chunk.message_start_time,
-            zlib.crc32(content),
-            len(content),
-        )
-    )
-
-
-def _raw_chunk(chunk: Chunk) -> bytes:
-    name = chunk.compression.encode()
-    body = struct.pack(
-        '<QQQII',
-        chunk.message_start_time,
-        chunk.message_end_time,
-        chunk.uncompressed_size,
-        chunk.uncompressed_crc,
-        len(name),
-    )
-    body += name + struct.pack('<Q', len(chunk.data)) + chunk.data
-    return struct.pack('<BQ', 6, len(body)) + body
+def _chunk_record(chunk: Chunk) -> bytes:
+    builder = RecordBuilder()
+    chunk.write(builder)
+    return builder.end()
 
 
 def _bag(content: dict[str, str], messages: list[bytes], random: np.random.Generator) -> bytes:
