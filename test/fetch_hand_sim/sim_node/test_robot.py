@@ -6,75 +6,68 @@ import math
 
 import pytest
 
+from fetch_hand_sim.sim_node.robot import Answer
 from msgs_spec.codecs import build_message
 from msgs_spec.topics import MAX_STEPS, topic
 
 
 def test_lockstep_takes_one_tick_per_valid_command_and_none_by_itself(make):
     case = make('lockstep')
+    assert case.robot.last_messages == []
     assert case.robot.wait() == 0.0  # the first reset
     case.robot.tick_when_due()
     case.clock.now += 1000.0
-    assert case.robot.wait() == math.inf
     with pytest.raises(ValueError, match='3 values given; allowed: 4'):
         case.robot.buffer.accept([0.0] * 3)
-    assert case.robot.wait() == math.inf
-    for _ in range(3):
-        case.robot.buffer.accept([0.1] * 4)
+    for tick in range(3):
+        assert (case.robot.wait(), case.place) == (math.inf, (0, tick))
+        case.command()
         assert case.robot.wait() == 0.0
         case.robot.tick_when_due()
-        assert case.robot.wait() == math.inf
-    assert [tick.status.tick for tick, _ in case.ticks] == [0, 1, 2, 3]
+    assert (case.robot.wait(), case.place) == (math.inf, (0, 3))
+    assert case.robot.last_messages == case.ticks[-1][1]
 
 
 def test_lockstep_steps_when_asked_and_realtime_only_while_paused(make):
     case = make('lockstep')
     case.robot.tick()
     assert case.robot.step().success
-    assert case.ticks[-1][0].status.tick == 1
+    assert case.place == (0, 1)
     case = make('realtime')
     case.robot.tick()
     answer = case.robot.step()
-    assert not answer.success
-    assert 'pause it first' in answer.message
+    assert not answer.success and 'pause it first' in answer.message
     assert len(case.ticks) == 1
     case.robot.pause(True)
     assert case.robot.wait() == math.inf
-    assert case.robot.step(3).message == '3 run, now at 1.120 s'
+    assert case.robot.step(3) == Answer(True, '3 run, now at 1.120 s')
     assert len(case.ticks) == 4
 
 
-@pytest.mark.parametrize('count', [0, -1, MAX_STEPS + 1, 2**64 - 1])
-def test_step_refuses_counts_that_would_block(make, count):
-    case = make('lockstep')
-    answer = case.robot.step(count)
-    assert not answer.success
-    assert f'allowed: 1 ... {MAX_STEPS}' in answer.message
-    assert case.ticks == []
-
-
-def test_step_ends_with_the_last_episode(make):
+def test_a_step_refuses_counts_that_would_block_and_ends_with_the_last_episode(make):
     case = make('lockstep', episodes=1)
-    answer = case.robot.step(60)
-    assert not answer.success
-    assert answer.message == 'all episodes are done; 51 of 60 ticks ran'
+    for count in (0, -1, MAX_STEPS + 1, 2**64 - 1):
+        line = f'{count} ticks given; allowed: 1 ... {MAX_STEPS}'
+        assert case.robot.step(count) == Answer(False, line)
+    assert case.ticks == []
+    line = 'all episodes are done; 51 of 60 ticks ran'
+    assert case.robot.step(60) == Answer(False, line)
 
 
 def test_a_running_robot_answers_and_resets_at_the_next_tick(make):
-    case = make()
-    assert case.robot.reset().message == (
-        'no episode is running; the next tick starts episode 0 with seed 0; '
-        'commands and goals count from then on'
-    )
+    case, end = make(), '; commands and goals count from then on'
+    no_episode = 'no episode is running; the next tick starts episode 0 with seed 0'
+    assert case.robot.reset().message == no_episode + end
     case.robot.tick()
-    assert case.robot.reset().message == (
-        'episode 0 ends; the next tick starts episode 1 with seed 1; '
-        'commands and goals count from then on'
-    )
+    first_ends = 'episode 0 ends; the next tick starts episode 1 with seed 1'
+    assert case.robot.reset().message == first_ends + end
     case.robot.tick()
-    status = case.ticks[-1][0].status
-    assert (status.episode, status.tick, status.phase) == (1, 0, 'reset')
+    assert (case.place, case.last.status.phase) == ((1, 0), 'reset')
     assert case.robot.counters.given_up == 1
+    case = make('lockstep', episodes=1)
+    case.robot.tick()
+    assert case.robot.reset().message == 'episode 0 ends; it was the last'
+    assert case.robot.wait() == math.inf
 
 
 @pytest.mark.parametrize('mode', ['realtime', 'lockstep'])
@@ -89,8 +82,7 @@ def test_a_paused_robot_publishes_the_state_after_a_reset_at_once(make, mode, be
     assert 'a tick of its own starts episode 1 with seed 1' in case.robot.reset().message
     assert case.robot.wait() == 0.0
     case.robot.tick_when_due()
-    assert (case.ticks[-1][0].status.episode, case.ticks[-1][0].status.tick) == (1, 0)
-    assert case.robot.wait() == math.inf
+    assert (case.robot.wait(), case.place) == (math.inf, (1, 0))
 
 
 def test_a_robot_in_lockstep_waits_with_a_reset_for_the_command_that_is_on_its_way(make):
@@ -100,34 +92,25 @@ def test_a_robot_in_lockstep_waits_with_a_reset_for_the_command_that_is_on_its_w
     case.clock.now += 0.05
     assert case.robot.reset().success
     assert 0.0 < case.robot.wait() <= 0.2
-    case.robot.buffer.accept([0.1] * 4)
+    case.command()
     assert case.robot.wait() == 0.0
     case.robot.tick_when_due()
-    assert (case.ticks[-1][0].status.episode, case.ticks[-1][0].status.tick) == (1, 0)
-    assert case.robot.wait() == math.inf
+    assert (case.robot.wait(), case.place) == (math.inf, (1, 0))
     # A policy would have answered by now.
     case.clock.now += 10.0
     assert case.robot.reset().success
     assert case.robot.wait() == 0.0
     case.robot.tick_when_due()
-    assert (case.ticks[-1][0].status.episode, case.ticks[-1][0].status.tick) == (2, 0)
-
-
-def test_a_reset_after_the_last_episode_starts_none(make):
-    case = make('lockstep', episodes=1)
-    case.robot.tick()
-    assert case.robot.reset().message == 'episode 0 ends; it was the last'
-    assert case.robot.wait() == math.inf
+    assert case.place == (2, 0)
 
 
 @pytest.mark.parametrize('factor', [0.0, 1.0, 20.0])
 def test_commands_that_stop_are_missed_in_any_mode(make, factor):
     case = make(factor=factor)
     for _ in range(3):
-        case.clock.now += 2.0
-        case.robot.tick_when_due()
+        case.tick_after(2.0)
         assert not case.robot.misses_commands, 'no command came yet'
-    case.robot.buffer.accept([0.1] * 4)
+    case.command()
     case.clock.now += 0.9
     assert not case.robot.misses_commands
     case.clock.now += 0.2
@@ -136,14 +119,11 @@ def test_commands_that_stop_are_missed_in_any_mode(make, factor):
         case.robot.tick_when_due()
     case.robot.tick_when_due()
     assert case.robot.misses_commands, 'the next episode misses them too'
-    case.robot.buffer.accept([0.1] * 4)
+    case.command()
     assert not case.robot.misses_commands
     case.clock.now += 5.0
     case.robot.pause(True)
     assert not case.robot.misses_commands
-
-
-def test_a_robot_in_lockstep_misses_the_next_command(make):
     case = make('lockstep')
     assert not case.robot.misses_commands
     case.robot.tick_when_due()
@@ -166,8 +146,7 @@ def test_paused_time_is_not_made_up_for(make):
 def test_late_ticks_are_counted_and_never_accumulate(make):
     case = make()
     for late in (0.0, 0.13, 0.0, 0.07):
-        case.clock.now += case.robot.wait() + late
-        case.robot.tick_when_due()
+        case.tick_after(case.robot.wait() + late)
     assert case.robot.schedule.missed_ticks == 3 + 1
     # The next tick stays on the old grid, less than a period from now.
     assert 0.0 < case.robot.wait() <= 0.04
@@ -181,23 +160,19 @@ def test_real_time_factor_changes_while_running(make, factor):
     case.robot.set_real_time_factor(factor)
     for _ in range(2):
         assert case.robot.wait() == pytest.approx(0.04 / factor)
-        case.clock.now += case.robot.wait()
-        case.robot.tick_when_due()
+        case.tick_after(case.robot.wait())
     assert case.robot.schedule.missed_ticks == 0
     case.robot.set_real_time_factor(0.0)
     assert case.robot.wait() == 0.0
 
 
-def _change_pace(robot):
-    robot.set_real_time_factor(0.08)
-
-
-def _pause_for_a_moment(robot):
-    robot.pause(True)
-    robot.pause(False)
-
-
-@pytest.mark.parametrize('meddle', [_change_pace, _pause_for_a_moment])
+@pytest.mark.parametrize(
+    'meddle',
+    [
+        lambda robot: robot.set_real_time_factor(0.08),
+        lambda robot: (robot.pause(True), robot.pause(False)),
+    ],
+)
 def test_a_robot_that_is_meddled_with_ticks_no_faster_than_asked(make, meddle):
     case = make(factor=0.08)
     for _ in range(32):
@@ -209,28 +184,21 @@ def test_a_robot_that_is_meddled_with_ticks_no_faster_than_asked(make, meddle):
     assert len(case.ticks) == 8
 
 
-def test_the_last_messages_are_kept(make):
-    case = make('lockstep')
-    assert case.robot.last_messages == []
-    case.robot.tick()
-    assert case.robot.last_messages == case.ticks[-1][1]
-
-
 def test_goals_that_are_refused_are_counted(make):
     case = make()
     target = topic(case.robot.runner.spec, 'set_goal')
 
-    def goal(*values):
-        return build_message(target, 0, values)
+    def set_goal(*values):
+        case.robot.set_goal(target, build_message(target, 0, values))
 
     with pytest.raises(ValueError, match='no episode is running'):
-        case.robot.set_goal(target, goal(1.0, 1.0, 1.0))
+        set_goal(1.0, 1.0, 1.0)
     case.robot.tick()
     with pytest.raises(ValueError, match=r'1e\+200 given; allowed: -1000 ... 1000'):
-        case.robot.set_goal(target, goal(1.0, 1e200, 0.5))
-    case.robot.set_goal(target, goal(1.3, 0.7, 0.6))
+        set_goal(1.0, 1e200, 0.5)
+    set_goal(1.3, 0.7, 0.6)
     case.robot.tick()
-    assert case.ticks[-1][0].desired_goal.tolist() == [1.3, 0.7, 0.6]
+    assert case.last.desired_goal.tolist() == [1.3, 0.7, 0.6]
     assert (case.robot.counters.goals_set, case.robot.counters.goals_rejected) == (1, 2)
 
 
@@ -245,7 +213,7 @@ def run(case, delays):
             left = answer - case.clock.now
             if 0.0 < left <= case.robot.wait():
                 case.clock.now = answer
-                case.robot.buffer.accept([0.1] * 4)
+                case.command()
             else:
                 case.clock.now += case.robot.wait()
         case.robot.tick_when_due()
@@ -256,28 +224,24 @@ def run(case, delays):
 def test_steps_without_a_new_command_are_counted_as_late(make):
     case = make()
     assert run(case, [0.01, None, 0.01, None, None]) == [0.04, 0.08, 0.12, 0.16, 0.2]
-    counts = [tick.late_commands for tick, _ in case.ticks]
-    assert counts == [0, 0, 1, 1, 2, 3]
+    assert [tick.late_commands for tick, _ in case.ticks] == [0, 0, 1, 1, 2, 3]
     assert case.robot.counters.late_commands == 3
     case.robot.reset()
     case.robot.tick_when_due()
-    assert case.ticks[-1][0].late_commands == 0, 'each episode has a count of its own'
+    assert case.last.late_commands == 0, 'each episode has a count of its own'
     assert case.robot.counters.late_commands == 3
 
 
-def test_no_command_is_late_before_the_first_and_after_the_last(make):
+def test_no_command_is_late_before_the_first_and_after_the_last_and_none_in_lockstep(make):
     case = make()
     run(case, [None] * 3)
     assert case.robot.counters.late_commands == 0
     run(case, [0.01, *[None] * 30])
     # After a second of silence no policy commands.
     assert 23 <= case.robot.counters.late_commands <= 25
-
-
-def test_lockstep_has_no_late_commands_and_does_not_count_them(make):
     case = make('lockstep', answer_wait=1.0)
     case.robot.tick_when_due()
-    case.robot.buffer.accept([0.1] * 4)
+    case.command()
     case.robot.tick_when_due()
     case.robot.step()
     assert [tick.late_commands for tick, _ in case.ticks] == [None] * 3
@@ -294,8 +258,7 @@ def test_a_tick_waits_for_its_answer_and_the_deadlines_move_with_it(make):
 
 
 def test_no_tick_waits_where_no_policy_commands(make):
-    case = make(answer_wait=0.02)
-    assert run(case, [None] * 3) == [0.04, 0.08, 0.12]
+    assert run(make(answer_wait=0.02), [None] * 3) == [0.04, 0.08, 0.12]
     case = make(answer_wait=0.02)
     case.robot.has_commander = True
     assert run(case, [None] * 3) == [0.06, 0.12, 0.18], 'the robot has waited for a policy'
@@ -305,26 +268,21 @@ def test_no_tick_waits_where_no_policy_commands(make):
 @pytest.mark.parametrize('answer_wait', [0.0, 0.1])
 def test_a_robot_as_fast_as_possible_waits_only_with_answer_wait(make, answer_wait):
     case = make(factor=0.0, answer_wait=answer_wait)
-    case.robot.buffer.accept([0.1] * 4)
+    case.command()
     case.robot.tick_when_due()
     assert case.robot.wait() == pytest.approx(answer_wait)
-    case.robot.buffer.accept([0.1] * 4)
+    case.command()
     assert case.robot.wait() == 0.0
 
 
 def test_a_command_that_answers_an_older_observation_is_late(make):
     case = make(answer_wait=0.02)
-    case.robot.buffer.accept([0.1] * 4)
+    case.command()
     case.robot.tick_when_due()
     older = case.robot.runner.stamp_ns
-    case.robot.buffer.accept([0.1] * 4, older)
-    assert case.robot.wait() == pytest.approx(0.04)
-    case.clock.now += 0.04
-    case.robot.tick_when_due()
-    assert case.robot.counters.late_commands == 0
-    case.robot.buffer.accept([0.2] * 4, older)
-    assert case.robot.wait() == pytest.approx(0.06)
-    case.clock.now += 0.06
-    case.robot.tick_when_due()
-    assert case.robot.counters.late_commands == 1
-    assert case.ticks[-1][0].applied_command.tolist() == [0.2] * 4
+    for value, wait, late in ((0.1, 0.04, 0), (0.2, 0.06, 1)):
+        case.command(value, older)
+        assert case.robot.wait() == pytest.approx(wait)
+        case.tick_after(case.robot.wait())
+        assert case.robot.counters.late_commands == late
+    assert case.last.applied_command.tolist() == [0.2] * 4
