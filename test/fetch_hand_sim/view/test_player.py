@@ -30,13 +30,6 @@ from support.episode_recorder import Recorder
 from support.tasks import each_task
 
 
-class Clock:
-    now = 0.0
-
-    def __call__(self):
-        return self.now
-
-
 @pytest.fixture(scope='module')
 def folder(tmp_path_factory):
     directory = tmp_path_factory.mktemp('episodes')
@@ -44,6 +37,13 @@ def folder(tmp_path_factory):
     for _ in range(3):
         recorder.record(EpisodeDirectory(directory))
     return directory
+
+
+class Clock:
+    now = 0.0
+
+    def __call__(self):
+        return self.now
 
 
 @pytest.fixture
@@ -96,7 +96,11 @@ def test_pause_steps_and_seeking(player, clock):
     player.perform(StepOnce())
     assert player.picture().facts.tick == 1
     player.perform(Seek(40))
-    assert player.picture().facts.tick == 40
+    picture = player.picture()
+    assert (picture.facts.tick, picture.facts.ticks) == (40, 50)
+    # Curves end at the playhead.
+    for series in (picture.graphs.distance, picture.graphs.reward, picture.graphs.commands):
+        assert len(series.times) == len(series.values) == 41
     player.perform(StepOnce(-1))
     assert player.picture().facts.tick == 39
     for beyond, end in ((-5, 0), (10**9, 50)):
@@ -125,65 +129,50 @@ def test_a_read_only_page_plays_on(folder, clock):
     assert not picture.facts.may_command and '--read-only' in picture.facts.notice
 
 
-def test_what_cannot_be_read_is_skipped_and_said(folder, tmp_path, clock):
+@pytest.fixture
+def damaged(folder, tmp_path):
+    """Two episodes that end in the middle."""
+    paths = [tmp_path / 'a.mcap', tmp_path / 'b.mcap']
+    data = next(find_playable(folder)[0].glob('*.mcap')).read_bytes()
+    for path in paths:
+        path.write_bytes(data[: len(data) // 2])
+    return paths
+
+
+def test_the_first_readable_episode_is_opened_and_unreadable_ones_are_named(folder, damaged, clock):
     good = find_playable(folder)
-    damaged = tmp_path / 'damaged.mcap'
-    damaged.write_bytes(b'nothing')
-    player = Player([good[0], damaged, good[1]], clock)
+
+    def shown(player):
+        picture = player.picture()
+        return picture.timeline.number, picture.facts.notice
+
+    number, notice = shown(Player([damaged[0], *good], clock))
+    assert number == 1 and 'skipped' in notice and 'a.mcap' in notice
+    number, notice = shown(Player([*damaged, *good], clock))
+    assert number == 2 and 'a.mcap' in notice and notice.endswith(' (and 1 more)')
+    with pytest.raises(EpisodeReadError, match=r'none of 2 episodes can be read; .*a\.mcap'):
+        Player(damaged, clock)
+    player = Player([good[0], damaged[0], good[1]], clock)
+    # A chosen one stays closed, and its neighbours are reached over it.
+    player.perform(OpenEpisode(1))
+    number, notice = shown(player)
+    assert number == 0 and 'a.mcap' in notice and 'skipped' not in notice
     player.perform(ChangeEpisode(1))
-    picture = player.picture()
-    assert picture.timeline.number == 2
-    assert 'damaged.mcap' in picture.facts.notice
+    number, notice = shown(player)
+    assert number == 2 and 'a.mcap' in notice
+    player.perform(OpenEpisode(0))
+    assert shown(player) == (0, '')
 
 
 def test_episodes_that_are_gone_are_said_to_be(folder, tmp_path, clock):
     shutil.copytree(folder, tmp_path / 'gone')
     player = Player(find_playable(tmp_path / 'gone'), clock)
-    player.picture()
     shutil.rmtree(tmp_path / 'gone')
     player.perform(ChangeEpisode(1))
     picture = player.picture()
     assert picture.timeline.number == 0
     assert 'none of 3 episodes can be read' in picture.facts.notice
     assert 'No such file' in picture.facts.notice
-
-
-def test_the_first_that_can_be_read_is_opened(folder, tmp_path, clock):
-    good = find_playable(folder)
-    damaged = []
-    for name in ('a.mcap', 'b.mcap'):
-        damaged.append(tmp_path / name)
-        data = next(good[0].glob('*.mcap')).read_bytes()
-        damaged[-1].write_bytes(data[: len(data) // 2])
-    picture = Player([damaged[0], *good], clock).picture()
-    assert picture.timeline.number == 1
-    assert 'skipped' in picture.facts.notice and 'a.mcap' in picture.facts.notice
-    picture = Player([*damaged, *good], clock).picture()
-    assert picture.timeline.number == 2
-    assert 'a.mcap' in picture.facts.notice and picture.facts.notice.endswith(' (and 1 more)')
-    with pytest.raises(EpisodeReadError, match=r'none of 2 episodes can be read; .*a\.mcap'):
-        Player(damaged, clock)
-
-
-def test_choosing_what_cannot_be_read_stays_and_says_why(folder, tmp_path, clock):
-    damaged = tmp_path / 'damaged.mcap'
-    damaged.write_bytes(b'nothing')
-    player = Player([*find_playable(folder), damaged], clock)
-    player.perform(OpenEpisode(3))
-    picture = player.picture()
-    assert picture.timeline.number == 0
-    assert 'damaged.mcap' in picture.facts.notice
-    player.perform(OpenEpisode(1))
-    assert player.picture().facts.notice == ''
-
-
-def test_curves_end_at_the_playhead(player):
-    player.perform(Seek(10))
-    picture = player.picture()
-    graphs = picture.graphs
-    for series in (graphs.distance, graphs.reward, graphs.commands):
-        assert len(series.times) == len(series.values) == 11
-    assert picture.facts.ticks == 50
 
 
 def test_fingers_are_comparable_with_the_command_of_the_gripper():
