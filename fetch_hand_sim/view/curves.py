@@ -29,10 +29,8 @@ class Curves:
     def __init__(self, spec: TaskSpec, metric: GoalMetric, length: int = 250) -> None:
         self._spec = spec
         self.metric = metric
-        commands = spec.robot.action_size
         # Columns: time, distance, rotation, reward, commands, positions.
-        self._rows = np.full((length, 4 + 2 * commands), np.nan)
-        self._count = 0
+        self._rows: deque[Array] = deque(maxlen=length)
         self._fingers = [
             index for index, name in enumerate(spec.robot.joints) if 'gripper_finger' in name
         ]
@@ -49,21 +47,27 @@ class Curves:
         distance, rotation = self.metric.distances(frame.achieved_goal, frame.desired_goal)
         # The reference's angle between q and -q is 2 pi; the page shows the shorter way.
         rotation = np.minimum(rotation, 2.0 * np.pi - rotation)
-        nothing = np.full(len(self._commanded), np.nan)
-        row = self._rows[self._count % len(self._rows)]
-        row[:4] = time, distance, rotation, np.nan if reward is None else reward
-        row[4:] = np.concatenate([nothing if command is None else command, self._positions(frame)])
-        self._count += 1
+        values = np.full((2, len(self._commanded)), np.nan)
+        if command is not None:
+            values[0] = command
+        values[1] = self._positions(frame)
+        first = [time, distance, rotation, np.nan if reward is None else reward]
+        self._rows.append(np.concatenate([first, *values]))
 
-    def graphs(self) -> Graphs:
-        """Return copies of the curves, sorted by time."""
+    def graphs(self, ticks: int | None = None) -> Graphs:
+        """Return the curves of the first `ticks` rows, or of all."""
         commands = len(self._commanded)
+        rows = np.array(self._rows).reshape(-1, 4 + 2 * commands)[:ticks]
+
+        def series(columns: int | slice) -> Series:
+            return Series(rows[:, 0], rows[:, columns])
+
         return Graphs(
-            distance=self._series(1) if self._spec.position_counts else None,
-            rotation=None if self._spec.rotation_threshold is None else self._series(2),
-            reward=self._series(3),
-            commands=self._series(slice(4, 4 + commands)),
-            positions=self._series(slice(4 + commands, None)),
+            distance=series(1) if self._spec.position_counts else None,
+            rotation=None if self._spec.rotation_threshold is None else series(2),
+            reward=series(3),
+            commands=series(slice(4, 4 + commands)),
+            positions=series(slice(4 + commands, None)),
         )
 
     def _positions(self, frame: Frame) -> Array:
@@ -77,12 +81,6 @@ class Curves:
             # From -1 (closed) to 1 (open), like the command.
             positions[index] = 2.0 * np.mean(joints[self._fingers]) / _FINGER_RANGE - 1.0
         return positions
-
-    def _series(self, columns: int | slice) -> Series:
-        size = len(self._rows)
-        order = np.arange(max(0, self._count - size), self._count) % size
-        rows = self._rows[order]
-        return Series(rows[:, 0].copy(), rows[:, columns].copy())
 
 
 class History:

@@ -5,7 +5,7 @@ A newer snapshot replaces an older one; every event arrives (`mujoco.studio.mess
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 
 from mujoco.studio import messages
 
@@ -73,11 +73,6 @@ class Series:
     times: Array
     values: Array
 
-    def until(self, time: float) -> Series:
-        """Return the part of the curve up to `time`, simulated seconds."""
-        known = self.times <= time + 1e-9
-        return Series(self.times[known], self.values[known])
-
 
 @dataclass(frozen=True, slots=True)
 class Graphs:
@@ -96,11 +91,6 @@ class Graphs:
     reward: Series | None = None
     commands: Series | None = None
     positions: Series | None = None
-
-    def until(self, time: float) -> Graphs:
-        """Return the part of each curve up to `time`, simulated seconds."""
-        series = (getattr(self, each.name) for each in fields(self))
-        return Graphs(*(each.until(time) if each is not None else None for each in series))
 
 
 @dataclass(frozen=True, slots=True)

@@ -164,13 +164,12 @@ class Player:
         self._recording = recording = load_recording(self._paths[number])
         self._number, self._position, self._notice = number, 0.0, ''
         arrays = recording.arrays
-        curves = Curves(recording.spec, recording.metric, length=len(recording.frames))
+        self._curves = Curves(recording.spec, recording.metric, length=len(recording.frames))
         for tick, frame in enumerate(recording.frames):
             step = tick - 1
             reward = float(arrays.rewards[step]) if tick else None
             command = arrays.commands[step] if tick else None
-            curves.add(float(recording.times[tick]), frame, reward, command)
-        self._graphs = curves.graphs()
+            self._curves.add(float(recording.times[tick]), frame, reward, command)
 
     def _advance(self) -> None:
         now = self._clock()
@@ -184,16 +183,15 @@ class Player:
     def _make_picture(self) -> Picture:
         recording, index = self._recording, self.index
         arrays = recording.arrays
-        time = float(recording.times[index])
         return Picture(
             task=recording.spec.name,
             frame=recording.frames[index],
             trail=tuple(trail_of(recording.frames, index)),
             facts=self._facts(index),
-            graphs=self._graphs.until(time),
+            graphs=self._curves.graphs(index + 1),
             command=arrays.commands[index - 1] if index else None,
             timeline=Timeline(
-                time=time,
+                time=float(recording.times[index]),
                 title=recording.title,
                 number=self._number,
                 count=len(self._paths),

@@ -62,7 +62,7 @@ class Address:
     @property
     def url(self) -> str:
         """The address to open in a browser."""
-        host = outside_host() if self.host in _EVERYWHERE else self.host
+        host = _outside_host() if self.host in _EVERYWHERE else self.host
         host = f'[{host}]' if ':' in host else host
         query = f'?token={self.token}' if self.token else ''
         return f'http://{host}:{self.port}/{query}'
@@ -153,25 +153,8 @@ def _read_touch() -> Touch:
     )
 
 
-def outside_host() -> str:
-    """Return the name by which other machines reach this one, else its address."""
-    name = socket.getfqdn()
-    for each in (name, socket.gethostname()):
-        if _leads_outside(each):
-            return each
-    return _outside_address() or name
-
-
-def _leads_outside(name: str) -> bool:
-    try:
-        found = socket.getaddrinfo(name, None, type=socket.SOCK_STREAM)
-    except (OSError, UnicodeError):
-        return False
-    return any(not is_loopback(str(address[0])) for *_, address in found)
-
-
-def _outside_address() -> str | None:
-    """Return the address from which this machine would send, or None without a network."""
+def _outside_host() -> str:
+    """Return the address from which this machine sends, or its name without a network."""
     for family, other in _OTHER_HOSTS:
         # `connect` of a datagram socket only chooses the route; it sends nothing.
         with suppress(OSError), socket.socket(family, socket.SOCK_DGRAM) as route:
@@ -179,7 +162,7 @@ def _outside_address() -> str | None:
             own = str(route.getsockname()[0])
             if not is_loopback(own):
                 return own
-    return None
+    return socket.gethostname()
 
 
 def open_page(
@@ -304,11 +287,9 @@ def announce(address: Address, wants_browser: bool) -> None:
     """Print the address, and open it in a browser if there is a display."""
     if address.warning:
         print(f'Warning: {address.warning}', flush=True)
-    # Compute it once: a name server may be slow.
-    url = address.url
-    print(f'The page is at {url} (Ctrl-C ends)', flush=True)
+    print(f'The page is at {address.url} (Ctrl-C ends)', flush=True)
     if wants_browser and _has_display():
-        open_browser(url)
+        open_browser(address.url)
 
 
 def _has_display() -> bool:
