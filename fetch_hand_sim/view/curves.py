@@ -57,7 +57,7 @@ class Curves:
     def graphs(self, ticks: int | None = None) -> Graphs:
         """Return the curves of the first `ticks` rows, or of all."""
         commands = len(self._commanded)
-        rows = np.array(self._rows).reshape(-1, 4 + 2 * commands)[:ticks]
+        rows = np.concatenate([[], *self._rows]).reshape(-1, 4 + 2 * commands)[:ticks]
 
         def series(columns: int | slice) -> Series:
             return Series(rows[:, 0], rows[:, columns])
