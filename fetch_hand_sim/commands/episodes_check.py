@@ -14,7 +14,7 @@ from typing import Any
 
 from fetch_hand_sim.episode_log import EpisodeReadError, expand_episodes
 from fetch_hand_sim.episode_log.files import holds_no_episode
-from fetch_hand_sim.episodes.checker import CheckResult, EpisodeChecker
+from fetch_hand_sim.episodes.checker import CheckResult, check_episode
 from node_runtime.command_line import (
     EXIT_FAILURE,
     EXIT_SUCCESS,
@@ -70,12 +70,11 @@ def _expand(paths: Sequence[Path]) -> tuple[list[Path], int]:
 
 def _check(episodes: Sequence[Path], results: list[CheckResult], is_quiet: bool) -> int:
     """Check episodes, append to `results`, and return the exit code."""
-    checker = EpisodeChecker()
     code = EXIT_SUCCESS
     with progress('episodes', len(episodes)) as advance:
         for episode in episodes:
             try:
-                result = checker.check(episode)
+                result = check_episode(episode)
             except EpisodeReadError as error:
                 complain(_NAME, error)
                 code = EXIT_USAGE

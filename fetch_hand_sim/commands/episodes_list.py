@@ -25,7 +25,7 @@ from fetch_hand_sim.episode_log import (
     find_leftovers,
     read_summary,
 )
-from fetch_hand_sim.episode_log.files import folders_below
+from fetch_hand_sim.episode_log.files import folders_below, read_each
 from fetch_hand_sim.episode_log.metadata import integer_or_none
 from msgs_spec.text import printable
 from node_runtime.command_line import (
@@ -54,17 +54,6 @@ _NUMBERS = frozenset({'seed', 'steps', 'return', 'seconds', 'KiB', 'late command
 # Wide enough for every column. A narrow terminal wraps lines, which keeps names whole.
 _WIDEST = 400
 _LONGEST_CELL = 60
-
-
-def read_summaries(directory: Path) -> tuple[list[EpisodeSummary], list[EpisodeReadError]]:
-    """Read all episodes of a folder; return the errors of the unreadable ones."""
-    episodes, errors = [], []
-    for path in find_episodes(directory):
-        try:
-            episodes.append(read_summary(path))
-        except EpisodeReadError as error:
-            errors.append(error)
-    return episodes, errors
 
 
 def make_table(episodes: Sequence[EpisodeSummary]) -> Table:
@@ -125,8 +114,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(options: argparse.Namespace) -> int:
+    errors: list[EpisodeReadError] = []
     try:
-        episodes, errors = read_summaries(options.directory)
+        episodes = list(read_each(find_episodes(options.directory), read_summary, errors.append))
         leftovers = find_leftovers(options.directory)
     except (EpisodeReadError, EpisodeLogError) as error:
         raise UsageError(str(error)) from None

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from fetch_hand_sim.episode_log.files import EpisodeReadError, expand_episodes
+from fetch_hand_sim.episode_log.files import EpisodeReadError, expand_episodes, read_each
 from fetch_hand_sim.episode_log.metadata import EpisodeOutcome, EpisodeRecord, HasOutcome
-from fetch_hand_sim.episode_log.reader import Episode, MessageRows, read_episode
+from fetch_hand_sim.episode_log.reader import Episode, one_line_errors, read_episode
 from msgs_spec.arrays import Array, Flags
 from msgs_spec.codecs import TopicCodec
 from msgs_spec.observations import ObservationAssembler
@@ -77,26 +77,14 @@ def load_episodes(
         on_skip: Called with the error of each unreadable episode, which is left out; by default the
             EpisodeReadError is raised.
     """
-    episodes = []
-    for candidate in expand_episodes(Path(path)):
-        try:
-            episodes.append(load_episode(candidate))
-        except EpisodeReadError as error:
-            if on_skip is None:
-                raise
-            on_skip(error)
-    return episodes
+    return list(read_each(expand_episodes(path), load_episode, on_skip))
 
 
 def load_episode(path: Path) -> EpisodeArrays:
     """Load one episode; see `load_episodes`."""
     file = read_episode(path)
-    try:
-        return _Decoder(file).decode()
-    except EpisodeReadError:
-        raise
-    except (ValueError, KeyError) as error:
-        raise EpisodeReadError(f'{file.path}: no readable episode: {error}') from error
+    with one_line_errors(file.path):
+        return _decode(file)
 
 
 @lru_cache(maxsize=256)
@@ -109,72 +97,58 @@ def _assembler(task: TaskSpec, control_hz: float) -> ObservationAssembler:
     return ObservationAssembler(task, control_hz)
 
 
-class _Decoder:
-    """Decodes the topics of one file and joins them by tick."""
+def _decode(file: Episode) -> EpisodeArrays:
+    """Decode the topics of a file and join them by tick, or raise ValueError."""
+    record = EpisodeRecord.parse(file.metadata)
+    task, assembler = record.task, _assembler(record.task, record.control_hz)
+    names = [spec.name for spec in assembler.topics]
+    # A cut-off episode may contain a part of its last tick.
+    ticks = min(file.count(name) for name in (*names, 'is_success'))
+    ticks = min(ticks, 1 + file.count('applied_command'))
+    stamps, _ = _codec(task, names[0]).decode_many(file.rows(names[0])[1][:ticks])
+    if not (np.diff(stamps) > 0).all():
+        raise ValueError('stamps do not grow')
+    vectors = {name: stamped_vectors(file, task, name, stamps) for name in names}
+    rewards = _unstamped_vectors(file, task, 'reward', stamps, first=1)[:, 0]
+    commands = _unstamped_vectors(file, task, 'applied_command', stamps, first=1)
+    steps = ticks - 1
+    outcome = EpisodeOutcome.parse(file.result)
+    if outcome.is_complete and outcome.steps not in (None, steps):
+        raise ValueError(f'it records {outcome.steps} steps and contains {steps}')
+    return EpisodeArrays(
+        path=file.path,
+        spec=record.spec,
+        observations=assembler.assemble(vectors),
+        actions=action_from_command(task.robot, commands),
+        commands=commands,
+        rewards=rewards,
+        terminated=np.zeros(steps, dtype=bool),
+        truncated=np.arange(steps) == steps - 1,
+        success=_unstamped_vectors(file, task, 'is_success', stamps, first=0)[:, 0] != 0.0,
+        stamps=stamps,
+        metadata=file.metadata,
+        record=record,
+        result=file.result,
+    )
 
-    def __init__(self, file: Episode) -> None:
-        self._file = file
-        self._record = EpisodeRecord.parse(file.metadata)
-        self._task = self._record.task
-        self._assembler = _assembler(self._task, self._record.control_hz)
 
-    def decode(self) -> EpisodeArrays:
-        states = {spec.name: self._file.rows(spec.name) for spec in self._assembler.topics}
-        success = self._file.rows('is_success')
-        # A cut-off episode may contain a part of its last tick.
-        ticks = min(len(rows.data) for rows in (*states.values(), success))
-        ticks = min(ticks, 1 + self._file.count('applied_command'))
-        stamps, vectors = self._states(states, ticks)
-        rewards = self._steps('reward', stamps)[:, 0]
-        commands = self._steps('applied_command', stamps)
-        steps = ticks - 1
-        outcome = EpisodeOutcome.parse(self._file.result)
-        if outcome.is_complete and outcome.steps not in (None, steps):
-            raise ValueError(f'it records {outcome.steps} steps and contains {steps}')
-        return EpisodeArrays(
-            path=self._file.path,
-            spec=self._record.spec,
-            observations=self._assembler.assemble(vectors),
-            actions=action_from_command(self._task.robot, commands),
-            commands=commands,
-            rewards=rewards,
-            terminated=np.zeros(steps, dtype=bool),
-            truncated=np.arange(steps) == steps - 1,
-            success=self._decoded('is_success', success, stamps, first=0)[:, 0] != 0.0,
-            stamps=stamps,
-            metadata=self._file.metadata,
-            record=self._record,
-            result=self._file.result,
-        )
+def stamped_vectors(file: Episode, task: TaskSpec, name: str, stamps: NDArray[np.int64]) -> Array:
+    """Return the vectors (N, size) of a topic with a message for each stamp, or ValueError."""
+    given, vectors = _codec(task, name).decode_many(file.rows(name)[1][: len(stamps)])
+    if not np.array_equal(given, stamps):
+        raise ValueError(f'{name} is missing at some ticks')
+    return vectors
 
-    def _states(
-        self, rows: dict[str, MessageRows], ticks: int
-    ) -> tuple[NDArray[np.int64], dict[str, Array]]:
-        """Return stamps and vectors of the observed topics, which share the stamp of each tick."""
-        vectors: dict[str, Array] = {}
-        stamps: NDArray[np.int64] | None = None
-        for name, found in rows.items():
-            given, values = _codec(self._task, name).decode_many(found.data[:ticks])
-            vectors[name] = values
-            stamps = given if stamps is None else stamps
-            if not np.array_equal(given, stamps):
-                raise ValueError(f'{name} has other stamps than the topics before it')
-        if stamps is None or not (np.diff(stamps) > 0).all():
-            raise ValueError('stamps do not grow')
-        return stamps, vectors
 
-    def _steps(self, name: str, stamps: NDArray[np.int64]) -> Array:
-        """Return the vectors of a topic that has no message at the reset, one per step."""
-        if len(stamps) == 1:
-            return np.zeros((0, topic(self._task, name).size))
-        return self._decoded(name, self._file.rows(name), stamps, first=1)
-
-    def _decoded(
-        self, name: str, rows: MessageRows, stamps: NDArray[np.int64], first: int
-    ) -> Array:
-        """Return the vectors of a topic without stamps; the log times tell their ticks."""
-        count = len(stamps) - first
-        ticks = np.searchsorted(stamps, rows.log_times[:count], side='right') - 1
-        if not np.array_equal(ticks, np.arange(first, len(stamps))):
-            raise ValueError(f'{name} is missing at some ticks')
-        return _codec(self._task, name).decode_many(rows.data[:count])[1]
+def _unstamped_vectors(
+    file: Episode, task: TaskSpec, name: str, stamps: NDArray[np.int64], first: int
+) -> Array:
+    """Return the vectors of a topic without stamps; the log times tell their ticks."""
+    count = len(stamps) - first
+    if not count:
+        return np.zeros((0, topic(task, name).size))
+    log_times, data = file.rows(name)
+    ticks = np.searchsorted(stamps, log_times[:count], side='right') - 1
+    if not np.array_equal(ticks, np.arange(first, len(stamps))):
+        raise ValueError(f'{name} is missing at some ticks')
+    return _codec(task, name).decode_many(data[:count])[1]

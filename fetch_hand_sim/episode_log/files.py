@@ -10,12 +10,15 @@ import errno
 import fcntl
 import os
 import stat
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from io import BufferedWriter
 from pathlib import Path
-from typing import IO, BinaryIO
+from typing import IO, BinaryIO, TypeVar
 
 from msgs_spec.text import first_of, printable
+
+Read = TypeVar('Read')
 
 # Errors: every message is one line of limited length that no terminal obeys.
 
@@ -153,6 +156,23 @@ def expand_episodes(path: Path | str) -> list[Path]:
     except OSError as error:
         raise EpisodeReadError(f'{path}: {error.strerror}') from error
     return find_episodes(path)
+
+
+def read_each(
+    paths: Iterable[Path],
+    read: Callable[[Path], Read],
+    on_skip: Callable[[EpisodeReadError], object] | None = None,
+) -> Iterator[Read]:
+    """Yield the result of `read` for each path; `on_skip` takes the errors, otherwise raised."""
+    for path in paths:
+        try:
+            result = read(path)
+        except EpisodeReadError as error:
+            if on_skip is None:
+                raise
+            on_skip(error)
+        else:
+            yield result
 
 
 def mcap_file(path: Path) -> Path:

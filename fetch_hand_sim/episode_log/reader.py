@@ -41,14 +41,6 @@ _LONGEST_SCHEMA = 8000
 
 
 @dataclass(frozen=True, slots=True)
-class MessageRows:
-    """The n messages of one topic by log time: times (n,), ns, and CDR bytes (n, size)."""
-
-    log_times: NDArray[np.int64]
-    data: NDArray[np.uint8]
-
-
-@dataclass(frozen=True, slots=True)
 class LoggedMessage:
     """One message; `sequence` counts the messages of a topic from 0, `data` are CDR bytes."""
 
@@ -113,18 +105,22 @@ class Episode(EpisodeSummary):
         """Return the number of messages of a topic; its namespace does not matter."""
         return len(self._indices(name))
 
-    def rows(self, name: str) -> MessageRows:
-        """Return the messages of a topic; raise EpisodeReadError if their sizes differ."""
+    def rows(self, name: str) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
+        """Return log times (n,), ns, and CDR bytes (n, size) of the messages of a topic.
+
+        Raises:
+            ValueError: Unless there are messages, all of one size.
+        """
         indices, messages = self._indices(name), self.sorted_messages
         starts, headers = messages.starts[indices], messages.headers[indices]
         sizes = headers['size']
         if not sizes.size or (sizes != sizes[0]).any():
             found = 'messages of several sizes' if sizes.size else 'no message'
-            raise EpisodeReadError(f'{self.path}: {found} of {name}; one size is needed')
+            raise ValueError(f'{found} of {name}; one size is needed')
         size = int(sizes[0]) - MESSAGE_FIELD_BYTES
         buffer = np.frombuffer(messages.unpacked, np.uint8)
         data = buffer[starts[:, None] + np.arange(MESSAGE.itemsize, MESSAGE.itemsize + size)]
-        return MessageRows(headers['log_time'].astype(np.int64), data)
+        return headers['log_time'].astype(np.int64), data
 
     def _indices(self, name: str) -> NDArray[np.int64]:
         for id, channel in self.channels.items():
@@ -179,7 +175,7 @@ def one_line_errors(file: Path) -> Iterator[None]:
         raise EpisodeReadError(f'{file}: {error.strerror or error}') from error
     except EpisodeReadError:
         raise
-    except (ValueError, MemoryError) as error:
+    except (ValueError, KeyError, MemoryError) as error:
         reason = _why_unfinished(file) or one_line(error)
         raise EpisodeReadError(f'{file}: {reason}') from error
 
@@ -210,7 +206,7 @@ def require_contract(metadata: dict[str, str], contents: Contents) -> None:
         task = parse_task(metadata)
     except ValueError:
         return
-    known = _known_topics(task)
+    known = contract_topics(task)
     namespaces = set()
     for channel in contents.channels.values():
         spec = known.get(relative_name(channel.topic))
@@ -236,17 +232,9 @@ def require_contract(metadata: dict[str, str], contents: Contents) -> None:
         raise ValueError(f'topics in several namespaces, {found}; allowed: one')
 
 
-def contract_topics(metadata: dict[str, str]) -> dict[str, TopicSpec]:
-    """Return the topics that the task of an episode has, by name without leading slash.
-
-    Raises:
-        ValueError: If the metadata name no known task.
-    """
-    return _known_topics(parse_task(metadata))
-
-
 @lru_cache(maxsize=256)
-def _known_topics(task: TaskSpec) -> dict[str, TopicSpec]:
+def contract_topics(task: TaskSpec) -> dict[str, TopicSpec]:
+    """Return the topics of a task by name without leading slash."""
     specs = (*topics(task), *ground_truth_topics(task))
     return {spec.name.lstrip('/'): spec for spec in specs}
 
@@ -306,13 +294,11 @@ class LoggedTick:
 
 def logged_topics(episode: Episode) -> dict[str, TopicSpec]:
     """Return the topics of an episode by resolved name, or raise EpisodeReadError."""
-    try:
-        known = contract_topics(episode.metadata)
-    except ValueError as error:
-        raise EpisodeReadError(f'{episode.path}: {error}') from error
-    if not episode.topics:
-        raise EpisodeReadError(f'{episode.path}: an episode without messages')
-    return {name: known[relative_name(name)] for name in episode.topics}
+    with one_line_errors(episode.path):
+        known = contract_topics(parse_task(episode.metadata))
+        if not episode.topics:
+            raise ValueError('an episode without messages')
+        return {name: known[relative_name(name)] for name in episode.topics}
 
 
 def split_ticks(episode: Episode) -> list[LoggedTick]:
@@ -327,20 +313,13 @@ def split_ticks(episode: Episode) -> list[LoggedTick]:
         for id, _, log_time, _, data in episode.sorted_messages.rows()
     )
     ticks: list[LoggedTick] = []
-    for message in messages:
-        if message.topic.name == _CLOCK:
-            ticks.append(LoggedTick(_stamp(episode, message)))
-        if not ticks:
-            raise EpisodeReadError(
-                f'{episode.path}: the first message is of {message.topic.name}, not {_CLOCK}'
-            )
-        is_published = message.topic.direction == 'published'
-        (ticks[-1].published if is_published else ticks[-1].received).append(message)
+    with one_line_errors(episode.path):
+        for message in messages:
+            if message.topic.name == _CLOCK:
+                clock = deserialize(message.topic.type_name, message.data)
+                ticks.append(LoggedTick(message_stamp(clock)))
+            if not ticks:
+                raise ValueError(f'the first message is of {message.topic.name}, not {_CLOCK}')
+            is_published = message.topic.direction == 'published'
+            (ticks[-1].published if is_published else ticks[-1].received).append(message)
     return ticks
-
-
-def _stamp(episode: Episode, clock: TickMessage) -> int:
-    try:
-        return message_stamp(deserialize(clock.topic.type_name, clock.data))
-    except ValueError as error:
-        raise EpisodeReadError(f'{episode.path}: unreadable clock ({one_line(error)})') from error

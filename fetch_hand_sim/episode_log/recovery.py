@@ -29,7 +29,7 @@ from fetch_hand_sim.episode_log.bag import (
 )
 from fetch_hand_sim.episode_log.files import EpisodeInUseError, EpisodeLogError
 from fetch_hand_sim.episode_log.indexes import require_one_meaning
-from fetch_hand_sim.episode_log.metadata import RECOVERED, EpisodeOutcome
+from fetch_hand_sim.episode_log.metadata import RECOVERED, EpisodeOutcome, parse_task
 from fetch_hand_sim.episode_log.reader import contract_topics, read_episode, require_contract
 from fetch_hand_sim.episode_log.records import (
     MAX_FILE_BYTES,
@@ -283,7 +283,7 @@ def _write(
     """Write the readable records as a valid file; return the text of its `metadata.yaml`."""
     contents, metadata = remains.contents, checked_strings(records[EPISODE])
     messages = contents.messages()
-    specs = contract_topics(metadata)
+    specs = contract_topics(parse_task(metadata))
     known = {
         id: (channel.topic, specs[relative_name(channel.topic)])
         for id, channel in contents.channels.items()

@@ -7,7 +7,8 @@ from bisect import bisect_right
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import lru_cache, partial
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -17,19 +18,13 @@ from fetch_hand_sim.episode_log import (
     Episode,
     EpisodeReadError,
     EpisodeRecord,
-    episode_metadata,
     read_episode,
 )
 from fetch_hand_sim.episode_log.bag import offered_qos_text
 from fetch_hand_sim.episode_log.metadata import RECOVERED
-from fetch_hand_sim.episode_log.reader import LoggedTick, logged_topics, split_ticks
+from fetch_hand_sim.episode_log.reader import LoggedTick, TickMessage, logged_topics, split_ticks
 from fetch_hand_sim.episodes.command_buffer import CommandBuffer
-from fetch_hand_sim.episodes.recorder import (
-    episode_result,
-    former_model_sha256,
-    mjcf_attachment,
-    model_sha256,
-)
+from fetch_hand_sim.episodes.recorder import RecordingContext, episode_result, former_model_sha256
 from fetch_hand_sim.episodes.runner import EpisodeRunner, accept_goal, accept_perturbation
 from fetch_hand_sim.simulation import Simulation
 from msgs_spec.arrays import Array
@@ -38,7 +33,6 @@ from msgs_spec.schemas import deserialize, type_hash
 from msgs_spec.text import one_line
 from msgs_spec.tick import EpisodeStatus, Tick, TickEncoder
 from msgs_spec.topics import TopicSpec
-from node_runtime.source_revision import source_revision
 
 # Characters of a value in a line.
 _LONGEST = 80
@@ -110,100 +104,68 @@ class CheckResult:
         return f'{self.path}: identical, {counts}{rest}{changes}'
 
 
-class _Reference:
-    """A simulation with the fingerprints and the text of its model."""
+@lru_cache(maxsize=1)
+def _reference(task: str, **rules: Any) -> tuple[Simulation, RecordingContext, str]:
+    """Return a simulation, its context and its former fingerprint; made once for equal rules."""
+    simulation = Simulation(task, num_threads=1, **rules)
+    context = RecordingContext(simulation, with_compiled_model=False)
+    return simulation, context, former_model_sha256(simulation.model)
 
-    def __init__(self, record: EpisodeRecord) -> None:
-        self.simulation = Simulation(
+
+def check_episode(path: Path) -> CheckResult:
+    """Simulate an episode again and compare it; `path` is a bag directory or MCAP file.
+
+    Raises:
+        EpisodeReadError: If the file is damaged or ambiguous, or the episode cannot be simulated
+            from its records.
+    """
+    episode = read_episode(path)
+    ticks = split_ticks(episode)
+    result = CheckResult(episode.path)
+    try:
+        record = EpisodeRecord.parse(episode.metadata)
+        _require_goals(episode)
+        simulation, context, former = _reference(
             record.task.name,
-            num_threads=1,
             reward_type=record.reward_type,
             success_rule=record.success_rule,
             control_hz=record.control_hz,
             timing=record.timing,
             disturbances=record.disturbances,
         )
-        self.fingerprint = model_sha256(self.simulation.model)
-        self.former_fingerprint = former_model_sha256(self.simulation.model)
-
-    @cached_property
-    def mjcf(self) -> bytes:
-        return mjcf_attachment(self.simulation.asset).data
-
-
-class EpisodeChecker:
-    """Checks one episode after the other; compiles a model only when the task changes."""
-
-    def __init__(self) -> None:
-        self._key: tuple[object, ...] = ()
-        self._reference: _Reference | None = None
-
-    def check(self, path: Path) -> CheckResult:
-        """Check one episode.
-
-        Args:
-            path: Bag directory or MCAP file.
-
-        Raises:
-            EpisodeReadError: If the file is damaged or ambiguous, or the episode cannot be
-                simulated from its records.
-        """
-        episode = read_episode(path)
-        ticks = split_ticks(episode)
-        try:
-            record = EpisodeRecord.parse(episode.metadata)
-            _require_goals(episode)
-            reference = self._reference_of(record)
-            runner = EpisodeRunner(
-                reference.simulation,
-                first_seed=record.seed - record.episode,
-                first_episode=record.episode,
-                first_stamp_ns=ticks[0].stamp_ns,
-                joint_prefix=record.joint_prefix,
-            )
-            result = CheckResult(episode.path)
-            start = _start_differences(episode, ticks, runner, reference, result)
-            result.difference = next(start, None)
-            if result.difference is None:
-                _compare(runner, ticks, episode, record, result)
-        except (ValueError, KeyError, OverflowError, RuntimeError) as error:
-            raise EpisodeReadError(
-                f'{episode.path}: cannot be simulated again ({one_line(error)})'
-            ) from error
-        return result
-
-    def _reference_of(self, record: EpisodeRecord) -> _Reference:
-        rules = (record.reward_type, record.success_rule, record.timing, record.disturbances)
-        key = (record.task.name, record.control_hz, *rules)
-        if self._reference is None or key != self._key:
-            self._reference, self._key = _Reference(record), key
-        return self._reference
+        runner = EpisodeRunner(
+            simulation,
+            first_seed=record.seed - record.episode,
+            first_episode=record.episode,
+            first_stamp_ns=ticks[0].stamp_ns,
+            joint_prefix=record.joint_prefix,
+        )
+        off = record.disturbances.is_off
+        disturbances = '' if off else record.disturbances.to_json()
+        status = dataclasses.replace(runner.waiting_status(), disturbances=disturbances)
+        here = context.metadata(status)
+        del here['started']
+        if episode.metadata.get('model_sha256') == former:
+            here['model_sha256'] = former
+        mjcf = context.attachments[0].data
+        differences = chain(
+            _start_differences(episode, ticks[0].stamp_ns, here, mjcf, result),
+            _topic_differences(episode, ticks),
+            _differences(runner, ticks, episode, record, result),
+        )
+        result.difference = next(differences, None)
+    except (ValueError, KeyError, OverflowError, RuntimeError) as error:
+        raise EpisodeReadError(
+            f'{episode.path}: cannot be simulated again ({one_line(error)})'
+        ) from error
+    return result
 
 
 def _start_differences(
-    episode: Episode,
-    ticks: list[LoggedTick],
-    runner: EpisodeRunner,
-    reference: _Reference,
-    result: CheckResult,
+    episode: Episode, stamp_ns: int, here: dict[str, str], mjcf: bytes, result: CheckResult
 ) -> Iterator[Difference]:
-    """Yield differences in parts that need no simulation; note changed software in `result`."""
+    """Yield differences from the metadata and the model here; note changed software."""
     recorded = episode.metadata
-    disturbances = runner.simulation.disturbances
-    is_former = recorded.get('model_sha256') == reference.former_fingerprint
-    here = episode_metadata(
-        runner.spec,
-        episode=runner.episode,
-        seed=runner.seed,
-        reward_type=runner.simulation.metric.reward_type,
-        success_rule=runner.simulation.metric.success_rule,
-        control_hz=runner.simulation.control_hz,
-        timing=runner.simulation.timing,
-        model_sha256=reference.former_fingerprint if is_former else reference.fingerprint,
-        source_revision=source_revision(),
-        disturbances='' if disturbances.is_off else disturbances.to_json(),
-    )
-    stamp_ns = ticks[0].stamp_ns
     for name, value in here.items():
         is_software = name in _SOFTWARE or name.endswith('_version')
         given = recorded.get(name, value if is_software else 'nothing')
@@ -214,9 +176,8 @@ def _start_differences(
             yield _difference(0, stamp_ns, f'metadata {name}', given, value)
     model = episode.attachments.get('model.xml')
     is_same = all(recorded.get(n, here[n]) == here[n] for n in ('model_sha256', 'mujoco_version'))
-    if model is not None and is_same and model != reference.mjcf:
+    if model is not None and is_same and model != mjcf:
         yield _difference(0, stamp_ns, 'attachment model.xml', 'another text', 'the model')
-    yield from _topic_differences(episode, ticks)
 
 
 def _topic_differences(episode: Episode, ticks: list[LoggedTick]) -> Iterator[Difference]:
@@ -243,57 +204,49 @@ def _topic_differences(episode: Episode, ticks: list[LoggedTick]) -> Iterator[Di
                 yield _difference(tick, stamps[tick], where, message.sequence, number)
 
 
-def _compare(
+def _differences(
     runner: EpisodeRunner,
     ticks: list[LoggedTick],
     episode: Episode,
     record: EpisodeRecord,
     result: CheckResult,
-) -> None:
-    """Simulate the episode and note in `result` how far it equals the recorded one."""
+) -> Iterator[Difference]:
+    """Simulate the episode, yield differences, and count identical ticks in `result`."""
     encoder = TickEncoder(runner.spec)
     is_recovered = episode.outcome.reason == RECOVERED
     received = _Received(runner, episode, record)
     for number, logged in enumerate(ticks):
+        differs = partial(_difference, number, logged.stamp_ns)
         command = _applied_command(logged) if number else runner.resting_command()
         if command is None:
             if logged is not ticks[-1]:
                 raise ValueError(f'no applied_command at tick {number}')
             result.unchecked = len(logged.published)
             if episode.is_complete:
-                result.difference = _difference(
-                    number, logged.stamp_ns, 'topics', 'no applied_command', 'applied_command'
-                )
+                yield differs('topics', 'no applied_command', 'applied_command')
             return
         if number and runner.is_between_episodes:
-            result.difference = _difference(
-                number, logged.stamp_ns, 'length', f'{len(ticks)} ticks', f'{number} ticks'
-            )
-            return
+            yield differs('length', f'{len(ticks)} ticks', f'{number} ticks')
         tick = runner.advance(command)
         drawn = episode.metadata.get('variation', '')
         if drawn != tick.status.variation:
-            result.difference = _difference(
-                number, logged.stamp_ns, 'metadata variation', drawn, tick.status.variation
-            )
-        else:
-            result.difference = received.difference(number, logged, command)
-        if result.difference is not None:
-            return
-        if record.interface_version == 1 and 'fingertip_poses' in tick.readings:
-            tick = _without_orientations(tick)
+            yield differs('metadata variation', drawn, tick.status.variation)
+        tick = _as_of(record.interface_version, tick)
         has_status = logged.find('episode_status') is not None
         expected = encoder.encode(tick, latched=has_status or tick.status.phase != 'running')
-        may_be_cut = logged is ticks[-1] and not runner.is_between_episodes
-        result.difference = _tick_difference(
-            number, logged, tick.stamp_ns, expected, may_be_cut, is_recovered
-        )
-        if result.difference is not None:
-            return
+        if logged is ticks[-1] and not runner.is_between_episodes:
+            expected = expected[: len(logged.published)]
+        # Recovery may leave out received messages.
+        others = [] if is_recovered else logged.received
+        for difference in chain(
+            received.differences(number, command),
+            _tick_differences(logged, others, tick.stamp_ns, expected),
+        ):
+            yield differs(*difference)
         result.ticks += 1
         result.messages += len(logged.published)
         received.take(logged)
-    result.difference = _result_difference(ticks[-1], tick.status, runner, episode)
+    yield from _result_differences(ticks[-1], tick.status, runner, episode)
 
 
 def _require_goals(episode: Episode) -> None:
@@ -303,23 +256,22 @@ def _require_goals(episode: Episode) -> None:
             raise ValueError(f'the file lacks some of the received messages of {name}')
 
 
-def _without_orientations(tick: Tick) -> Tick:
-    """Remove the fingertip orientations, which robots of interface version 1 did not publish."""
+def _as_of(interface_version: int, tick: Tick) -> Tick:
+    """Return the tick of a robot of a version; fingertips of version 1 had no orientation."""
+    if interface_version != 1 or 'fingertip_poses' not in tick.readings:
+        return tick
     poses = tick.readings['fingertip_poses'].reshape(-1, 7).copy()
     poses[:, 3:] = [1.0, 0.0, 0.0, 0.0]
     return dataclasses.replace(tick, readings={**tick.readings, 'fingertip_poses': poses.ravel()})
 
 
-def _result_difference(
+def _result_differences(
     last: LoggedTick, status: EpisodeStatus, runner: EpisodeRunner, episode: Episode
-) -> Difference | None:
+) -> Iterator[Difference]:
     """Compare the record `episode_result` with the last tick."""
-    expected = episode_result(status)
-    expected['complete'] = 'false'
-    if runner.is_between_episodes:
-        # All ticks of an episode may be there although its end was cut off.
-        recorded = episode.result.get('complete')
-        expected['complete'] = 'false' if recorded == 'false' else 'true'
+    # All ticks of an episode may be there although its end was cut off.
+    is_whole = runner.is_between_episodes and episode.result.get('complete') != 'false'
+    expected = {**episode_result(status), 'complete': 'true' if is_whole else 'false'}
     # A file that was cut short may lack all but `complete`.
     missing = {'complete': 'nothing'}
     for name in sorted({*expected, *episode.result.keys() - _NOT_SIMULATED}):
@@ -327,8 +279,7 @@ def _result_difference(
         recorded = episode.result.get(name, missing.get(name, simulated))
         if recorded != simulated:
             where = f'episode_result {one_line(name, longest=40)}'
-            return _difference(status.tick, last.stamp_ns, where, recorded, simulated)
-    return None
+            yield _difference(status.tick, last.stamp_ns, where, recorded, simulated)
 
 
 def _applied_command(logged: LoggedTick) -> Array | None:
@@ -349,18 +300,14 @@ class _Received:
         is_recovered = outcome.reason == RECOVERED
         self._lacks_commands = is_recovered or bool(_COMMANDS & outcome.received_not_logged.keys())
 
-    def difference(self, number: int, logged: LoggedTick, command: Array) -> Difference | None:
+    def differences(self, number: int, command: Array) -> Iterator[tuple[str, object, object]]:
         """Compare the applied command of a tick with the last valid one received before it."""
         if not number:
             self._commands.start_episode(self._runner.resting_command())
-        if self._lacks_commands or not self._commands.has_fresh_command:
-            return None
-        received = self._commands.take()
-        if np.array_equal(command, received):
-            return None
-        return _difference(
-            number, logged.stamp_ns, 'applied_command', command, f'{received} received'
-        )
+        if not self._lacks_commands and self._commands.has_fresh_command:
+            received = self._commands.take()
+            if not np.array_equal(command, received):
+                yield 'applied_command', command, f'{received} received'
 
     def take(self, logged: LoggedTick) -> None:
         """Apply the messages received after the tick `logged`."""
@@ -380,35 +327,24 @@ class _Received:
                         accept_perturbation(self._runner, each.topic, message, limit)
 
 
-def _tick_difference(
-    number: int,
+def _tick_differences(
     logged: LoggedTick,
+    received: list[TickMessage],
     stamp_ns: int,
     expected: list[tuple[TopicSpec, bytes]],
-    may_be_cut: bool,
-    is_recovered: bool,
-) -> Difference | None:
-    stamp = logged.stamp_ns
-    # Recovery may leave out received messages.
-    received = [] if is_recovered else logged.received
+) -> Iterator[tuple[str, object, object]]:
+    """Yield field, recorded and simulated value of each difference in the messages of a tick."""
     names = [message.topic.name for message in logged.published]
     wanted = [topic.name for topic, _ in expected]
-    if may_be_cut:
-        wanted = wanted[: len(names)]
     if names != wanted:
-        return _difference(number, stamp, 'topics', ', '.join(names), ', '.join(wanted))
-    for rank, (message, (topic, data)) in enumerate(zip(logged.published, expected, strict=False)):
+        yield 'topics', ', '.join(names), ', '.join(wanted)
+    for message, (topic, data) in zip(logged.published, expected, strict=False):
         if message.data != data:
             where, recorded, simulated = _field_difference(topic, message.data, data)
-            return _difference(number, stamp, f'{topic.name}{where}', recorded, simulated)
-        if message.log_time_ns != stamp_ns + rank:
-            times = message.log_time_ns, stamp_ns + rank
-            return _difference(number, stamp, f'log time of {topic.name}', *times)
-    for rank, message in enumerate(received, start=len(logged.published)):
-        if message.log_time_ns != stamp_ns + rank:
-            times = message.log_time_ns, stamp_ns + rank
-            return _difference(number, stamp, f'log time of {message.topic.name}', *times)
-    return None
+            yield f'{topic.name}{where}', recorded, simulated
+    for time_ns, message in enumerate([*logged.published, *received], start=stamp_ns):
+        if message.log_time_ns != time_ns:
+            yield f'log time of {message.topic.name}', message.log_time_ns, time_ns
 
 
 def _field_difference(topic: TopicSpec, recorded: bytes, simulated: bytes) -> tuple[str, str, str]:

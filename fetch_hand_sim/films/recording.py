@@ -5,21 +5,20 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
 
 from fetch_hand_sim.episode_log import EpisodeReadError
-from fetch_hand_sim.episode_log.arrays import EpisodeArrays, load_episode
-from fetch_hand_sim.episode_log.files import expand_episodes, holds_no_episode
-from fetch_hand_sim.episode_log.reader import Episode, read_episode
+from fetch_hand_sim.episode_log.arrays import EpisodeArrays, load_episode, stamped_vectors
+from fetch_hand_sim.episode_log.files import expand_episodes, holds_no_episode, read_each
+from fetch_hand_sim.episode_log.reader import one_line_errors, read_episode
 from fetch_hand_sim.simulation.rendering import SceneRenderer
 from fetch_hand_sim.simulation.rewards import GoalMetric
 from fetch_hand_sim.simulation.scene import Frame, Scene, trail_of
 from msgs_spec.arrays import Array, Picture
-from msgs_spec.codecs import TopicCodec
 from msgs_spec.tasks import TaskSpec
-from msgs_spec.topics import topic
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,11 +48,12 @@ def load_recording(path: Path) -> Recording:
 
 def recording_of(arrays: EpisodeArrays) -> Recording:
     """Add the joint positions and object poses of the file to an episode."""
-    ticks = len(arrays) + 1
-    task = arrays.record.task
-    messages = read_episode(arrays.path)
-    joints = _vectors(messages, arrays, 'joint_states')[:, : len(task.robot.joints)]
-    poses = _vectors(messages, arrays, 'object_pose') if arrays.spec.has_object else None
+    task, stamps = arrays.record.task, arrays.stamps
+    file, poses = read_episode(arrays.path), None
+    with one_line_errors(file.path):
+        joints = stamped_vectors(file, task, 'joint_states', stamps)[:, : len(task.robot.joints)]
+        if task.has_object:
+            poses = stamped_vectors(file, task, 'object_pose', stamps)
     achieved, desired = arrays.observations['achieved_goal'], arrays.goals
     frames = [
         Frame(
@@ -63,24 +63,10 @@ def recording_of(arrays: EpisodeArrays) -> Recording:
             object_pose=None if poses is None else poses[tick],
             is_success=bool(arrays.success[tick]),
         )
-        for tick in range(ticks)
+        for tick in range(len(stamps))
     ]
-    times = (arrays.stamps - arrays.stamps[0]) * 1e-9
+    times = (stamps - stamps[0]) * 1e-9
     return Recording(arrays, frames, times, arrays.path.stem.removesuffix('_0'))
-
-
-def _vectors(messages: Episode, arrays: EpisodeArrays, name: str) -> Array:
-    """Return the vectors (N + 1, size) of a topic that has one message per tick."""
-    # An interrupted episode may contain a part of one more tick.
-    stamps = arrays.stamps
-    try:
-        rows = messages.rows(name).data[: len(stamps)]
-        given, vectors = TopicCodec(topic(arrays.record.task, name)).decode_many(rows)
-    except (ValueError, KeyError) as error:
-        raise EpisodeReadError(f'{messages.path}: no readable {name}: {error}') from error
-    if not np.array_equal(given, stamps):
-        raise EpisodeReadError(f'{messages.path}: {name} is missing at some ticks')
-    return vectors
 
 
 def load_recordings(
@@ -92,17 +78,9 @@ def load_recordings(
         on_skip: Called with the error of each unreadable episode, which is left out; None raises
             that error.
     """
-    recordings: list[Recording] = []
     skipped: list[EpisodeReadError] = []
-    for each in find_playable(path):
-        if len(recordings) == count:
-            break
-        try:
-            recordings.append(load_recording(each))
-        except EpisodeReadError as error:
-            if on_skip is None:
-                raise
-            skipped.append(error)
+    each = read_each(find_playable(path), load_recording, on_skip and skipped.append)
+    recordings = list(islice(each, count))
     if not recordings:
         raise none_readable(skipped)
     if on_skip is not None:

@@ -54,15 +54,15 @@ class ReplayNode(Node):
         self._publishers_by_topic = {name: self._open(name) for name in self._schedule.topics}
         self._next = 0
         self._last_clock: bytes | None = None
-        self._playhead = Playhead(
-            self._start_ns,
-            self._settings['rate'],
-            time.monotonic(),
-            is_paused=self._settings['start_paused'],
-        )
+        self._is_paused = self._settings['start_paused']
+        self._playhead = Playhead(self._start_ns, self._rate, time.monotonic())
         self.create_service(SetBool, '~/pause', self._on_pause)
         self.add_on_set_parameters_callback(set_callback(REPLAY_NODE))
         self.add_post_set_parameters_callback(self._apply_changes)
+
+    @property
+    def _rate(self) -> float:
+        return 0.0 if self._is_paused else float(self._settings['rate'])
 
     def _read_schedule(self) -> ReplaySchedule:
         path = self._settings['path']
@@ -189,7 +189,7 @@ class ReplayNode(Node):
                 self._playhead.jump(due, now)
         position = self._playhead.position_ns(now)
         while (
-            not self._playhead.is_paused
+            not self._is_paused
             and self._next < len(messages)
             and messages[self._next].time_ns <= position
         ):
@@ -206,19 +206,16 @@ class ReplayNode(Node):
             self._last_clock = message.data
 
     def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
-        if request.data == self._playhead.is_paused:
+        if request.data == self._is_paused:
             response.message = 'already paused' if request.data else 'already running'
         else:
             response.message = 'paused' if request.data else 'running'
-        if request.data:
-            self._playhead.pause(time.monotonic())
-        else:
-            self._playhead.resume(time.monotonic())
+        self._is_paused = request.data
+        self._playhead.set_rate(self._rate, time.monotonic())
         response.success = True
         return response
 
     def _apply_changes(self, changes: list[Any]) -> None:
         for change in changes:
             self._settings[change.name] = change.value
-            if change.name == 'rate':
-                self._playhead.set_rate(float(change.value), time.monotonic())
+        self._playhead.set_rate(self._rate, time.monotonic())

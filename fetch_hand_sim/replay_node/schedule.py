@@ -9,9 +9,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from fetch_hand_sim.episode_log import Episode, EpisodeReadError, read_episode
+from fetch_hand_sim.episode_log import read_episode
 from fetch_hand_sim.episode_log.metadata import parse_control_hz
-from fetch_hand_sim.episode_log.reader import logged_topics
+from fetch_hand_sim.episode_log.reader import logged_topics, one_line_errors
 from msgs_spec.schemas import deserialize
 from msgs_spec.topics import TopicSpec, relative_name
 
@@ -46,7 +46,9 @@ class ReplaySchedule:
     def __init__(self, path: Path, topics: Iterable[str] = (), with_inputs: bool = False) -> None:
         episode = read_episode(path)
         specs = logged_topics(episode)
-        _require_names(episode)
+        with one_line_errors(episode.path):
+            self.period_ns = round(1e9 / parse_control_hz(episode.metadata))
+            _require_names(specs)
         wanted = _wanted(specs, list(topics), with_inputs)
         self.topics = {name: specs[name] for name in episode.topics if name in wanted}
         self.messages = sorted(
@@ -57,13 +59,11 @@ class ReplaySchedule:
             ),
             key=lambda message: message.time_ns,
         )
-        for message in self.messages:
-            _require_readable(episode.path, self.topics[message.name], message)
-        times = [m.log_time_ns for logged in episode.topics.values() for m in logged.messages]
-        if not times:
-            raise EpisodeReadError(f'{episode.path}: an episode without messages')
-        self.start_ns, self.end_ns = min(times), max(times)
-        self.period_ns = _period_ns(episode)
+        with one_line_errors(episode.path):
+            for message in self.messages:
+                deserialize(self.topics[message.name].type_name, message.data)
+        times = episode.sorted_messages.headers['log_time']
+        self.start_ns, self.end_ns = int(times[0]), int(times[-1])
         status = next((n for n in episode.topics if n.endswith('/episode_status')), '/')
         self.namespace = status.rpartition('/')[0]
 
@@ -94,70 +94,39 @@ def _wanted(specs: dict[str, TopicSpec], names: list[str], with_inputs: bool) ->
     return {name for name, s in specs.items() if with_inputs or s.direction == 'published'}
 
 
-def _period_ns(episode: Episode) -> int:
-    try:
-        return round(1e9 / parse_control_hz(episode.metadata))
-    except ValueError as error:
-        raise EpisodeReadError(f'{episode.path}: {error}') from error
-
-
-def _require_names(episode: Episode) -> None:
-    for name in episode.topics:
+def _require_names(names: Iterable[str]) -> None:
+    for name in names:
         if len(name) > _LONGEST_NAME or not _TOPIC_NAME.fullmatch(name):
-            raise EpisodeReadError(
-                f'{episode.path}: topic {name[:_SHOWN]!r}; allowed: names of ROS, '
-                f'up to {_LONGEST_NAME} characters'
+            raise ValueError(
+                f'topic {name[:_SHOWN]!r}; allowed: names of ROS, up to {_LONGEST_NAME} characters'
             )
-
-
-def _require_readable(path: Path, spec: TopicSpec, message: ReplayMessage) -> None:
-    try:
-        deserialize(spec.type_name, message.data)
-    except ValueError as error:
-        raise EpisodeReadError(
-            f'{path}: {message.name} at {message.time_ns} ns is no {spec.type_name}'
-        ) from error
 
 
 class Playhead:
     """Position in an episode over time.
 
-    `now` is seconds of any steady clock, `rate` recorded seconds per second.
+    `now` is seconds of any steady clock, `rate` recorded seconds per second; 0 pauses.
     """
 
-    def __init__(self, position_ns: int, rate: float, now: float, is_paused: bool) -> None:
+    def __init__(self, position_ns: int, rate: float, now: float) -> None:
         self._position_ns = position_ns
         self._since = now
-        self._rate = rate
-        self.is_paused = is_paused
+        self.rate = rate
 
     def position_ns(self, now: float) -> int:
         """Return the log time up to which messages are due."""
-        if self.is_paused:
-            return self._position_ns
-        return self._position_ns + int((now - self._since) * self._rate * 1e9)
+        return self._position_ns + int((now - self._since) * self.rate * 1e9)
 
     def remaining(self, time_ns: int, now: float) -> float:
         """Return the seconds until a log time is due; infinity while paused."""
-        if self.is_paused:
+        if not self.rate:
             return math.inf
-        return (time_ns - self._position_ns) / 1e9 / self._rate - (now - self._since)
-
-    def pause(self, now: float) -> None:
-        """Pause."""
-        self._position_ns, self._since = self.position_ns(now), now
-        self.is_paused = True
-
-    def resume(self, now: float) -> None:
-        """Resume."""
-        if self.is_paused:
-            self._since = now
-        self.is_paused = False
+        return (time_ns - self._position_ns) / 1e9 / self.rate - (now - self._since)
 
     def set_rate(self, rate: float, now: float) -> None:
         """Change the rate from now on."""
-        self._position_ns, self._since = self.position_ns(now), now
-        self._rate = rate
+        self.jump(self.position_ns(now), now)
+        self.rate = rate
 
     def jump(self, position_ns: int, now: float) -> None:
         """Go to a position."""

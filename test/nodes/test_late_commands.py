@@ -11,7 +11,7 @@ import pytest
 
 from fetch_hand_sim.commands.episodes_list import main as list_episodes
 from fetch_hand_sim.episode_log import Episode
-from fetch_hand_sim.episodes.checker import EpisodeChecker
+from fetch_hand_sim.episodes.checker import check_episode
 from fetch_hand_sim.episodes.runner import FIRST_STAMP_NS
 from msgs_spec.codecs import CommandCodec, answered_stamp, message_stamp
 from msgs_spec.schemas import deserialize
@@ -92,7 +92,7 @@ def test_late_commands_are_in_diagnostics_in_the_file_and_in_the_list(
     assert late is not None and fewest < late == unanswered(episode)
     assert f'success, {late} late commands' in output or f'failure, {late} late' in output
     assert f'late_commands: "{late}"' in (episode.path.parent / 'metadata.yaml').read_text()
-    assert EpisodeChecker().check(episode.path).difference is None
+    assert check_episode(episode.path).difference is None
     assert list_episodes([str(tmp_path)]) == 0
     header, row, *_ = capsys.readouterr().out.splitlines()
     assert header.endswith('late commands') and row.split()[-1] == str(late)

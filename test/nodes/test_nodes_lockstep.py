@@ -10,7 +10,7 @@ import pytest
 from std_srvs.srv import Trigger
 
 from fetch_hand_sim.episode_log import read_summary
-from fetch_hand_sim.episodes.checker import EpisodeChecker
+from fetch_hand_sim.episodes.checker import check_episode
 from fetch_hand_sim.episodes.command_buffer import CommandBuffer
 from fetch_hand_sim.episodes.runner import EpisodeRunner
 from fetch_hand_sim.simulation import Simulation
@@ -105,7 +105,7 @@ def test_a_disturbed_episode_is_the_same_over_ros_in_the_batch_and_in_its_check(
     assert [without_times(each) for each in logged] == batch
     assert logged[0]['/ground_truth/joint_states'] != logged[0]['/joint_states']
     for path in tmp_path.iterdir():
-        assert EpisodeChecker().check(path).difference is None
+        assert check_episode(path).difference is None
         assert 'action_latency' in read_summary(path).metadata['variation']
 
 
@@ -126,7 +126,7 @@ def test_disturbances_change_between_episodes(start_process: Start, tmp_path: Pa
     first, *_, last = sorted(tmp_path.iterdir())
     assert 'disturbances' not in read_summary(first).metadata
     assert 'latency' in read_summary(last).metadata['disturbances']
-    assert EpisodeChecker().check(last).difference is None
+    assert check_episode(last).difference is None
 
 
 @pytest.mark.release
@@ -143,7 +143,7 @@ def test_an_episode_at_250_hz_takes_ten_times_the_ticks(
     assert len(episode['/applied_command']) == len(episode['/commands']) == 500
     (path,) = (tmp_path / 'log').iterdir()
     assert read_summary(path).duration_s == pytest.approx(2.0, abs=1e-6)
-    assert EpisodeChecker().check(path).difference is None
+    assert check_episode(path).difference is None
 
 
 def test_resets_leave_a_policy_no_tick_behind(start_process: Start, tmp_path: Path) -> None:

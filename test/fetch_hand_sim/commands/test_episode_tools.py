@@ -27,7 +27,7 @@ from fetch_hand_sim.episode_log import (
 from fetch_hand_sim.episode_log.metadata import parse_task
 from fetch_hand_sim.episode_log.reader import split_ticks
 from fetch_hand_sim.episodes import checker
-from fetch_hand_sim.episodes.checker import EpisodeChecker
+from fetch_hand_sim.episodes.checker import check_episode
 from fetch_hand_sim.episodes.generator import EpisodeGenerator
 from fetch_hand_sim.episodes.recorder import RecordingContext, former_model_sha256, model_sha256
 from fetch_hand_sim.simulation import Simulation
@@ -98,9 +98,8 @@ def rewrite(source, directory, change=lambda tick, name, data: data, result=None
 def test_generated_episodes_equal_those_of_one_robot(generated):
     """Batch and single robot, bit for bit, with number, seed and stamps of a series."""
     task, paths = generated
-    checker = EpisodeChecker()
     for index, path in enumerate(paths):
-        result = checker.check(path)
+        result = check_episode(path)
         assert result.difference is None, result
         assert result.changed == []
         assert result.ticks == TASKS[task].episode_ticks + 1
@@ -135,7 +134,7 @@ def test_other_rates_rewards_and_rules_check_too(tmp_path):
         reward_type='dense',
         success_rule='paper',
     )
-    result = EpisodeChecker().check(paths[0])
+    result = check_episode(paths[0])
     assert result.difference is None and not result.changed
     metadata = read_summary(paths[0]).metadata
     assert (metadata['timing'], metadata['episode_ticks'], result.ticks) == ('seconds', '250', 251)
@@ -145,7 +144,7 @@ def test_episodes_of_robots_that_kept_ticks_check_as_they_were(tmp_path):
     (path,) = generate(tmp_path, 'FetchReach', episodes=1, control_hz=125.0, timing='ticks')
     metadata = read_summary(path).metadata
     assert 'timing' not in metadata and metadata['episode_ticks'] == '50'
-    result = EpisodeChecker().check(path)
+    result = check_episode(path)
     assert (result.difference, result.changed, result.ticks) == (None, [], 51)
 
 
@@ -170,7 +169,7 @@ def test_check_names_the_first_tick_and_field_that_differ(reach, tmp_path):
     # The last byte but those of velocity, effort and their lengths is that of a position.
     position_end = size - 2 * (8 * joints + 8)
     path = rewrite(source, tmp_path, flip('joint_states', 7, position_end - 8))
-    difference = EpisodeChecker().check(path).difference
+    difference = check_episode(path).difference
     assert difference is not None
     assert (difference.tick, difference.field) == (7, f'joint_states.position[{joints - 1}]')
     assert difference.recorded != difference.simulated
@@ -179,16 +178,16 @@ def test_check_names_the_first_tick_and_field_that_differ(reach, tmp_path):
 
 def test_check_detects_a_changed_command(reach, tmp_path):
     path = rewrite(min(reach.iterdir()), tmp_path, flip('applied_command', 20, -27))
-    difference = EpisodeChecker().check(path).difference
+    difference = check_episode(path).difference
     assert difference is not None and difference.tick == 20
 
 
 def test_check_compares_applied_commands_with_received_ones(tmp_path):
     """The physics of FetchReach ignores the gripper, the last value."""
     path = Recorder('FetchReach').record(EpisodeDirectory(tmp_path))
-    assert EpisodeChecker().check(path).difference is None
+    assert check_episode(path).difference is None
     changed = rewrite(path, tmp_path / 'changed', flip('applied_command', 20, -3))
-    difference = EpisodeChecker().check(changed).difference
+    difference = check_episode(changed).difference
     assert difference is not None
     assert (difference.tick, difference.field) == (20, 'applied_command')
 
@@ -201,14 +200,14 @@ def test_check_compares_applied_commands_with_received_ones(tmp_path):
     ],
 )
 def test_check_detects_missing_and_wrong_values(reach, tmp_path, change, field):
-    result = EpisodeChecker().check(rewrite(min(reach.iterdir()), tmp_path, change))
+    result = check_episode(rewrite(min(reach.iterdir()), tmp_path, change))
     assert result.difference is not None
     assert result.difference.field.startswith(field)
 
 
 def test_check_notices_a_result_that_is_not_true(reach, tmp_path):
     path = rewrite(min(reach.iterdir()), tmp_path, result={'return': '0.0'})
-    difference = EpisodeChecker().check(path).difference
+    difference = check_episode(path).difference
     assert difference is not None and difference.field == 'episode_result return'
 
 
@@ -218,12 +217,12 @@ def test_check_notices_an_end_that_is_neither(reach, complete, monkeypatch):
     # Files of this project contain one or the other.
     said = dataclasses.replace(episode, result={**episode.result, 'complete': complete})
     monkeypatch.setattr(checker, 'read_episode', lambda path: said)
-    difference = EpisodeChecker().check(episode.path).difference
+    difference = check_episode(episode.path).difference
     assert difference is not None and difference.field == 'episode_result complete'
 
 
 def test_check_accepts_an_interrupted_episode(reach, tmp_path):
-    result = EpisodeChecker().check(rewrite(min(reach.iterdir()), tmp_path, last=20))
+    result = check_episode(rewrite(min(reach.iterdir()), tmp_path, last=20))
     assert result.difference is None and result.ticks == 20
 
 
@@ -232,7 +231,7 @@ def test_check_names_the_version_that_changed(reach, tmp_path):
     writer = EpisodeWriter(tmp_path, 'old', {**episode.metadata, 'mujoco_version': '3.9.0'})
     for tick in split_ticks(episode):
         writer.write_tick(tick.stamp_ns, [(m.topic, m.data) for m in tick.published])
-    result = EpisodeChecker().check(writer.finish(episode.result))
+    result = check_episode(writer.finish(episode.result))
     assert [change.split()[:2] for change in result.changed] == [['mujoco', '3.9.0']]
 
 
@@ -252,7 +251,7 @@ def test_check_runs_goals_that_were_set_on_the_way(tmp_path):
             writer.write_received(goal_topic, encoder.encode(tick.stamp_ns, goal))
             recorder.runner.simulation.set_goal(goal[None])
     path = writer.finish({})
-    assert EpisodeChecker().check(path).difference is None
+    assert check_episode(path).difference is None
     (arrays,) = load_episodes(path)
     assert len(np.unique(arrays.goals, axis=0)) == 2
 
@@ -263,7 +262,7 @@ def test_the_fingerprint_of_a_log_of_1_0_is_known_too(tmp_path, monkeypatch):
     path = recorder.record(EpisodeDirectory(tmp_path))
     recorded = read_episode(path).metadata['model_sha256']
     assert recorded != model_sha256(recorder.simulation.model)
-    assert not [line for line in EpisodeChecker().check(path).changed if 'model' in line]
+    assert not [line for line in check_episode(path).changed if 'model' in line]
 
 
 def test_check_episode_codes(reach, tmp_path, capsys):
@@ -554,7 +553,7 @@ def test_recover_makes_bags_of_leftovers_and_names_failures(reach, tmp_path, cap
     aside = [tmp_path / f'.{source.name}.aside' for source in sources]
     assert sorted(tmp_path.iterdir()) == sorted([*aside, tmp_path / sources[0].name])
     assert len(find_episodes(tmp_path)) == 1
-    result = EpisodeChecker().check(tmp_path / sources[0].name)
+    result = check_episode(tmp_path / sources[0].name)
     assert result.difference is None and 10 < result.ticks < 51
     (arrays,) = load_episodes(tmp_path / sources[0].name)
     assert len(arrays) == int(arrays.result['steps']) == result.ticks - 1

@@ -20,7 +20,7 @@ from fetch_hand_sim.episode_log import (
     recover_episode,
 )
 from fetch_hand_sim.episode_log import records as limits
-from fetch_hand_sim.episodes.checker import EpisodeChecker
+from fetch_hand_sim.episodes.checker import check_episode
 from fetch_hand_sim.replay_node.schedule import ReplaySchedule
 from msgs_spec.schemas import MAX_MESSAGE_BYTES
 from msgs_spec.topics import topic
@@ -92,7 +92,7 @@ def test_no_flood_makes_a_file_that_a_reader_refuses(tmp_path, recorder, ticks, 
 
 def test_a_flooded_episode_checks_and_replays(tmp_path, recorder, ticks):
     path = write(tmp_path, recorder, ticks, [('commands', 10_000_000)] * 8)
-    result = EpisodeChecker().check(path)
+    result = check_episode(path)
     assert result.difference is None and result.ticks == 51
     assert len(ReplaySchedule(path).messages) == sum(len(tick.messages) for tick in ticks)
 

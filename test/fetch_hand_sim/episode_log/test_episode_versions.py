@@ -8,7 +8,7 @@ from pathlib import Path
 
 from fetch_hand_sim.commands import episodes_check, episodes_list
 from fetch_hand_sim.episode_log import load_episodes, read_episode, read_summary, recover_episode
-from fetch_hand_sim.episodes.checker import EpisodeChecker
+from fetch_hand_sim.episodes.checker import check_episode
 from fetch_hand_sim.replay_node.schedule import ReplaySchedule
 
 # Logged by version 0.1 at revision 2ce2393; never to be written again.
@@ -45,6 +45,6 @@ def test_cut_off_it_is_recovered(tmp_path):
     leftover.mkdir()
     (leftover / 'old_0.mcap').write_bytes(FILE.read_bytes()[: FILE.stat().st_size // 2])
     path = recover_episode(leftover)
-    result = EpisodeChecker().check(path)
+    result = check_episode(path)
     assert result.difference is None and result.ticks > 20
     shutil.rmtree(path)

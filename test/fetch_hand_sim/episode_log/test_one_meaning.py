@@ -20,7 +20,7 @@ from fetch_hand_sim.episode_log import (
     read_episode,
     read_summary,
 )
-from fetch_hand_sim.episodes.checker import EpisodeChecker
+from fetch_hand_sim.episodes.checker import check_episode
 from fetch_hand_sim.films.recording import load_recording
 from fetch_hand_sim.replay_node.schedule import ReplaySchedule
 from msgs_spec.schemas import schema_text
@@ -36,7 +36,7 @@ READERS = [
     load_episodes,
     load_recording,
     ReplaySchedule,
-    EpisodeChecker().check,
+    check_episode,
 ]
 
 
@@ -361,7 +361,7 @@ def assert_same(path, original):
     assert read_summary(path).message_count == read_summary(original).message_count == 509
     assert len(load_recording(path).frames) == 51
     assert len(ReplaySchedule(path).messages) == 459
-    result = EpisodeChecker().check(path)
+    result = check_episode(path)
     assert (result.difference, result.ticks) == (None, 51)
 
 
@@ -553,7 +553,7 @@ def later_command(parts):
 def test_the_check_compares_everything_that_a_reader_returns(parts, tmp_path, make, where):
     path = tmp_path / 'file.mcap'
     path.write_bytes(make(parts))
-    difference = EpisodeChecker().check(path).difference
+    difference = check_episode(path).difference
     assert difference is not None and where in difference.field
 
 
@@ -572,7 +572,7 @@ def test_long_and_repeated_names_make_short_lines(parts, tmp_path):
     times = range(parts.last_ns + 1, parts.last_ns + 40_001)
     path.write_bytes(parts.file(chunk(*(message(clock[1], time, clock[2]) for time in times))))
     try:
-        line = str(EpisodeChecker().check(path))
+        line = str(check_episode(path))
     except EpisodeReadError as error:
         line = str(error)
     assert len(line) < 500

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from fetch_hand_sim.episode_log import EpisodeDirectory, load_episodes
-from fetch_hand_sim.episodes.checker import EpisodeChecker
+from fetch_hand_sim.episodes.checker import check_episode
 from fetch_hand_sim.episodes.recorder import RecordingContext
 from fetch_hand_sim.episodes.runner import EpisodeRunner
 from fetch_hand_sim.simulation import Simulation
@@ -67,7 +67,7 @@ def test_episodes_without_orientations_are_checked_and_loaded_as_the_others(tmp_
     simulation = Simulation('HandReach', num_threads=1)
     paths = [record(simulation, tmp_path / str(version), version) for version in (1, 2)]
     for path in paths:
-        result = EpisodeChecker().check(path)
+        result = check_episode(path)
         assert (result.difference, result.ticks) == (None, TICKS)
     (before,), (now,) = map(load_episodes, paths)
     for name, values in before.observations.items():

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from fetch_hand_sim.episode_log import EpisodeDirectory, read_episode
-from fetch_hand_sim.episodes.checker import EpisodeChecker
+from fetch_hand_sim.episodes.checker import check_episode
 from fetch_hand_sim.episodes.runner import EpisodeRunner, accept_goal
 from fetch_hand_sim.simulation import Simulation
 from msgs_spec.codecs import build_message
@@ -114,7 +114,7 @@ def test_the_check_takes_the_goals_that_the_robot_took(tmp_path, interface_versi
     path, count = record_with_goals(tmp_path, interface_version)
     assert count == taken
     assert len(read_episode(path).topics['/set_goal'].messages) == 6
-    result = EpisodeChecker().check(path)
+    result = check_episode(path)
     assert result.difference is None, result
 
 
@@ -139,5 +139,5 @@ def test_a_flood_of_refused_goals_leaves_an_episode_that_can_be_checked(tmp_path
     assert 0 < logged < 40
     omitted = json.loads(read_episode(path).result['received_not_logged'])
     assert omitted == {'set_goal (refused)': 300 - logged}
-    result = EpisodeChecker().check(path)
+    result = check_episode(path)
     assert result.difference is None, result

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fetch_hand_sim.episode_log import EpisodeDirectory, load_episodes, read_episode
-from fetch_hand_sim.episodes.checker import EpisodeChecker
+from fetch_hand_sim.episodes.checker import check_episode
 from fetch_hand_sim.episodes.command_buffer import CommandBuffer
 from fetch_hand_sim.episodes.recorder import RecordingContext
 from fetch_hand_sim.episodes.runner import EpisodeRunner
@@ -61,7 +61,7 @@ def test_logs_of_renamed_joints_are_checked_and_loaded_as_the_others(
     assert (metadata['joint_prefix'], json.loads(metadata['joint_order'])) == (prefix, expected)
     assert 'joint_prefix' not in read_episode(plain).metadata
     for path in (plain, renamed):
-        result = EpisodeChecker().check(path)
+        result = check_episode(path)
         assert (result.difference, result.ticks) == (None, TICKS)
     (one,), (other,) = load_episodes(plain), load_episodes(renamed)
     assert one.spec is other.spec is TASKS[task]

@@ -380,19 +380,16 @@ def test_an_episode_whose_topics_have_no_names_of_ros_is_refused(episode, tmp_pa
 
 
 def test_playhead_follows_rate_and_pauses():
-    head = Playhead(1_000, 2.0, now=10.0, is_paused=True)
+    head = Playhead(1_000, 0.0, now=10.0)
     assert head.position_ns(99.0) == 1_000
     assert head.remaining(10**9, 99.0) == float('inf')
-    head.resume(100.0)
+    head.set_rate(2.0, 100.0)
     assert head.position_ns(100.5) == 1_000 + 10**9
     assert head.remaining(1_000 + 2 * 10**9, 100.5) == pytest.approx(0.5)
     head.set_rate(0.5, 100.5)
     assert head.position_ns(101.5) == 1_000 + 1_500_000_000
-    head.pause(101.5)
-    head.pause(110.0)
+    for now in (101.5, 110.0):
+        head.set_rate(0.0, now)
     assert head.position_ns(200.0) == 1_000 + 1_500_000_000
-    head.resume(200.0)
-    head.resume(201.0)
-    assert head.position_ns(202.0) == 1_000 + 2_500_000_000
     head.jump(7, 300.0)
     assert head.position_ns(300.0) == 7
