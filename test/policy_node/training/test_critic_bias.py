@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from policy_node.training.critic_bias import main
-from policy_node.training.values_and_returns import discounted, measure
+from policy_node.training.critic_bias import discounted, measure
 from support.runs import trainer_of
 
 
