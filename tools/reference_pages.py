@@ -13,11 +13,9 @@ from pathlib import Path
 
 from fetch_hand_sim.__main__ import COMMANDS, Command
 from msgs_spec.tasks import TASKS
-from policy_node.training.configuration.config import DEFAULTS
+from policy_node.training.configuration.config import DEFAULTS, FIELDS, Field
 from policy_node.training.configuration.flat import (
-    FIELDS,
     RESEARCH,
-    Field,
     to_flat,
     value_text,
 )

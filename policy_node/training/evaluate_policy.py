@@ -28,10 +28,8 @@ from policy_node.training.evaluation import (
     summarize,
 )
 from policy_node.training.policy_options import (
-    add_batch_options,
-    add_disturbances_option,
     add_policy_options,
-    add_reward_options,
+    add_simulation_options,
     load_chosen_policy,
     make_chosen_simulation,
     policy_errors,
@@ -48,9 +46,7 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     """Parse the command line."""
     parser = CommandParser(prog=_NAME, description=__doc__)
     add_policy_options(parser)
-    add_batch_options(parser, num_envs=100)
-    add_disturbances_option(parser)
-    add_reward_options(parser)
+    add_simulation_options(parser, num_envs=100)
     add, seed = parser.add_argument, whole_number(0, LARGEST_SEED)
     add('--first-seed', type=seed, default=FIRST_SEED, help=f'default: {FIRST_SEED}')
     add(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,11 +17,6 @@ from fetch_hand_sim.simulation import Simulation
 from fetch_hand_sim.simulation.tasks.hand_manipulate import PALM_HEIGHT
 from msgs_spec.tasks import GoalKind, TaskSpec
 from policy_node.policies.policy import Policy
-
-if TYPE_CHECKING:
-    # These import torch, which the help of commands does without.
-    from policy_node.policies.actor import Actor
-    from policy_node.training.configuration.config import TrainConfig
 
 # Far from the seeds of training and of its evaluations.
 FIRST_SEED = 2_000_000_000
@@ -222,46 +217,9 @@ def training_seeds(sequence: np.random.SeedSequence, count: int) -> list[int]:
     return [int(seed) % EVALUATION_SEED for seed in sequence.generate_state(count) >> 2]
 
 
-class Evaluator:
-    """Evaluates the policies of a run, always on the same episodes, in separate simulations.
-
-    So evaluations do not change the training episodes.
-    """
-
-    def __init__(self, simulation: Simulation, config: TrainConfig) -> None:
-        self._simulation = simulation
-        self._config = config
-
-    def evaluate(self, actor: Actor, best_success: float) -> EpisodeOutcomes:
-        """Evaluate an actor; end early if its success rate cannot reach `best_success`.
-
-        This is assumed once `best_success` lies above the 95 % interval of the episodes so far.
-        """
-        rule = self._config.success_rule
-
-        def hopeless(outcomes: EpisodeOutcomes) -> bool:
-            count = int(successes(outcomes, rule).sum())
-            return wilson_interval(count, len(outcomes))[1] < best_success
-
-        episodes = self._config.evaluation_episodes
-        return evaluate(self._simulation, actor, episodes, EVALUATION_SEED, hopeless)
-
-    def success_of(self, policy: Policy) -> float:
-        """Return the success rate of a policy over all evaluation episodes."""
-        episodes = self._config.evaluation_episodes
-        outcomes = evaluate(self._simulation, policy, episodes, EVALUATION_SEED)
-        return success_rate(outcomes, self._config.success_rule)
-
-
-def successes(outcomes: EpisodeOutcomes, success_rule: str) -> NDArray[np.bool_]:
-    """Return which episodes succeed at the last step, by the rule `gymnasium` or `paper`."""
-    paper = success_rule == 'paper'
-    return outcomes.success_paper if paper else outcomes.success_gymnasium
-
-
 def success_rate(outcomes: EpisodeOutcomes, success_rule: str) -> float:
     """Return the share of episodes that succeed at the last step, by `gymnasium` or `paper`."""
-    return float(successes(outcomes, success_rule).mean())
+    return float(getattr(outcomes, f'success_{success_rule}').mean())
 
 
 _DIAGNOSES = {

@@ -34,10 +34,8 @@ from node_runtime.command_line import (
 )
 from policy_node.policies.policy import RandomPolicy
 from policy_node.training.policy_options import (
-    add_batch_options,
-    add_disturbances_option,
     add_policy_options,
-    add_reward_options,
+    add_simulation_options,
     load_chosen_policy,
     make_chosen_simulation,
     policy_errors,
@@ -50,9 +48,7 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     """Parse the command line."""
     parser = CommandParser(prog=_NAME, description=__doc__)
     add_policy_options(parser)
-    add_batch_options(parser, num_envs=64)
-    add_disturbances_option(parser)
-    add_reward_options(parser)
+    add_simulation_options(parser, num_envs=64)
     add, seed = parser.add_argument, whole_number(0, LARGEST_SEED)
     add('--output', type=Path, required=True, help='directory in which episodes are collected')
     add('--first-seed', type=seed, default=0, help='episode i has this seed plus i; default: 0')

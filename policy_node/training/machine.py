@@ -134,9 +134,8 @@ class Workers:
         if self.world_size == 1:
             return
         for tensor in tensors:
-            message = tensor.detach().to(self.device, copy=True)
-            distributed.broadcast(message, src=0)
-            tensor.detach().copy_(message)
+            values = tensor.detach()
+            values.copy_(self.sum(values if self.is_first else torch.zeros_like(values)))
 
     def any(self, flag: bool) -> bool:
         """Return whether `flag` is True on any worker. All must call this together."""

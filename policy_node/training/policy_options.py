@@ -37,16 +37,12 @@ def add_batch_options(parser: argparse.ArgumentParser, num_envs: int, episodes: 
     add('--threads', type=int, default=0, help='simulation threads; default: all cores')
 
 
-def add_disturbances_option(parser: argparse.ArgumentParser) -> None:
-    """Add the option `--disturbances`."""
-    presets = 'none, mild, hardware, severe, scaled as in hardware*0.5, or a YAML file'
-    help_text = f'of the robot: {presets}; default: none'
-    parser.add_argument('--disturbances', default='none', help=help_text)
-
-
-def add_reward_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options `--success-rule` and `--reward-type`."""
+def add_simulation_options(parser: argparse.ArgumentParser, num_envs: int) -> None:
+    """Add the options that `make_chosen_simulation` reads."""
+    add_batch_options(parser, num_envs)
     add = parser.add_argument
+    presets = 'none, mild, hardware, severe, scaled as in hardware*0.5, or a YAML file'
+    add('--disturbances', default='none', help=f'of the robot: {presets}; default: none')
     add('--success-rule', choices=SUCCESS_RULES, default='gymnasium', help='of the reward')
     add('--reward-type', choices=REWARD_TYPES, default='sparse', help='of the return')
 
@@ -75,7 +71,7 @@ def policy_errors() -> Iterator[None]:
 
 
 def make_chosen_simulation(options: argparse.Namespace, loaded: LoadedPolicy) -> Simulation:
-    """Return the simulations for a policy that the batch, reward and disturbances options choose.
+    """Return the simulations for a policy that the options of `add_simulation_options` choose.
 
     Raises:
         UsageError: If an option does not fit the policy.

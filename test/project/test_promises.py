@@ -14,7 +14,7 @@ from msgs_spec.parameters import NODES
 from msgs_spec.tasks import TASKS
 from msgs_spec.tick import PHASES, EpisodeStatus
 from msgs_spec.topics import MONITORING, SERVICES, topics
-from policy_node.training.configuration.flat import FIELDS
+from policy_node.training.configuration.config import FIELDS
 from support import ROOT
 
 # One promise per line, written by `write` when 1.0 was released. Lines may be added, never changed.

@@ -6,7 +6,7 @@ import ast
 import runpy
 from collections.abc import Iterator
 
-from policy_node.training.configuration.flat import FIELDS
+from policy_node.training.configuration.config import FIELDS
 from policy_node.training.configuration.recipes import recipe_config
 from support import ROOT
 

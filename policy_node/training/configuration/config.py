@@ -6,7 +6,8 @@ reads the values that users give.
 
 from __future__ import annotations
 
-import dataclasses
+import ast
+import inspect
 import math
 import typing
 from collections.abc import Callable, Iterator
@@ -346,8 +347,8 @@ class TrainConfig(
         Raises:
             ValueError: If a value is not allowed, or fields exclude each other.
         """
-        for name, kind in TYPES.items():
-            require_within(name, getattr(self, name), kind)
+        for name, each in FIELDS.items():
+            each.require(getattr(self, name))
         for is_broken, reason in _rules(self, task_spec(self.task, control_hz=self.control_hz)):
             if is_broken:
                 raise ValueError(reason)
@@ -378,52 +379,67 @@ class TrainConfig(
         return self.first_distance != 1.0 or self.first_rotation != 1.0
 
 
-# Annotated types of the fields, and their defaults.
-TYPES: dict[str, Any] = {
-    each.name: hint
-    for hints in [typing.get_type_hints(TrainConfig, include_extras=True)]
-    for each in dataclasses.fields(TrainConfig)
-    for hint in [hints[each.name]]
-}
-DEFAULTS: dict[str, Any] = {
-    each.name: {} if each.name == 'goals' else each.default
-    for each in dataclasses.fields(TrainConfig)
-    if each.name != 'task'
-}
+@dataclass(frozen=True, slots=True)
+class Field:
+    """One field of `TrainConfig`, for help texts and parsing.
 
-
-def range_of(kind: Any) -> Range | None:
-    """Return the `Range` in a field's type, or None if the type has none."""
-    return kind.__metadata__[0] if typing.get_origin(kind) is Annotated else None
-
-
-def choices_of(kind: Any) -> tuple[str, ...]:
-    """Return the allowed values of a `Literal` type; an empty tuple for any other type."""
-    return typing.get_args(kind) if typing.get_origin(kind) is Literal else ()
-
-
-def plain_type(kind: Any) -> Any:
-    """Return a field's type without its `Range`; `str` for a `Literal`."""
-    if typing.get_origin(kind) is Annotated:
-        return typing.get_args(kind)[0]
-    return str if choices_of(kind) else kind
-
-
-def require_within(name: str, value: Any, kind: Any) -> None:
-    """Raise ValueError if `value` is outside the choices or the range in the field's type `kind`.
-
-    Raises:
-        ValueError: In one line, the field, the value and the allowed values.
+    Attributes:
+        group: Title of its group in the help.
+        meaning: Description of the field, on one line.
+        kind: Type of the field, without its range.
+        choices: Allowed values if the field has a fixed set of them, else an empty tuple.
+        limits: Allowed range if the field is a number with limits, else None.
+        default: Default of the field; None for `task`, which has no default.
     """
-    choices, limits = choices_of(kind), range_of(kind)
-    if choices and value not in choices:
-        raise ValueError(f'{name} {value!r:.80}; allowed: {", ".join(choices)}')
-    if plain_type(kind) is int and abs(value) > LARGEST:
-        raise ValueError(f'{name} is too large; allowed: up to {LARGEST}')
-    if plain_type(kind) is float and not math.isfinite(value):
-        raise ValueError(f'{name} {value} is no finite number')
-    if limits and not limits.low <= value <= limits.high:
-        raise ValueError(f'{name} {value}; allowed: {limits}')
+
+    name: str
+    group: str
+    meaning: str
+    kind: Any
+    choices: tuple[str, ...]
+    limits: Range | None
+    default: Any
+
+    def require(self, value: Any) -> None:
+        """Raise ValueError if the type of the field does not allow a value."""
+        name, limits = self.name, self.limits
+        if self.choices and value not in self.choices:
+            raise ValueError(f'{name} {value!r:.80}; allowed: {", ".join(self.choices)}')
+        if self.kind is int and abs(value) > LARGEST:
+            raise ValueError(f'{name} is too large; allowed: up to {LARGEST}')
+        if self.kind is float and not math.isfinite(value):
+            raise ValueError(f'{name} {value} is no finite number')
+        if limits and not limits.low <= value <= limits.high:
+            raise ValueError(f'{name} {value}; allowed: {limits}')
+
+
+def _describe() -> Iterator[Field]:
+    """Yield all fields in the order of the groups; titles and meanings are read from the source."""
+    hints = typing.get_type_hints(TrainConfig, include_extras=True)
+    for group in reversed(TrainConfig.__mro__[1:-1]):
+        (tree,) = ast.parse(inspect.getsource(group)).body
+        assert isinstance(tree, ast.ClassDef)
+        title = (ast.get_docstring(tree) or '').splitlines()[0].rstrip('.')
+        for pair in pairwise(tree.body):
+            match pair:
+                case ast.AnnAssign(ast.Name(name)), ast.Expr(ast.Constant(str(text))):
+                    kind, choices, limits = _parts(hints[name])
+                    default = {} if name == 'goals' else getattr(TrainConfig, name, None)
+                    meaning = ' '.join(text.split())
+                    yield Field(name, title, meaning, kind, choices, limits, default)
+
+
+def _parts(hint: Any) -> tuple[Any, tuple[str, ...], Range | None]:
+    """Return the plain type, the choices and the range of an annotation."""
+    if typing.get_origin(hint) is Literal:
+        return str, typing.get_args(hint), None
+    is_ranged = typing.get_origin(hint) is Annotated
+    return (hint.__origin__, (), hint.__metadata__[0]) if is_ranged else (hint, (), None)
+
+
+FIELDS = {each.name: each for each in _describe()}
+"""All fields by name, in the order of the groups."""
+DEFAULTS = {name: each.default for name, each in FIELDS.items() if name != 'task'}
 
 
 # Fields that have an effect only with others: their names, what they need, and the test of it.

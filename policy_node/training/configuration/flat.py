@@ -6,10 +6,7 @@ Values come from options, `--set`, `train(**fields)`, recipes and stored runs.
 from __future__ import annotations
 
 import argparse
-import ast
 import dataclasses
-import inspect
-import itertools
 import types
 import typing
 from collections.abc import Iterable, Mapping
@@ -18,18 +15,14 @@ from typing import Any
 import numpy as np
 
 from msgs_spec.text import did_you_mean
-from policy_node.training.configuration import config
 from policy_node.training.configuration.config import (
     DEFAULTS,
+    FIELDS,
     LARGEST,
     NEEDS,
-    TYPES,
     WITHOUT_EFFECT,
-    Range,
+    Field,
     TrainConfig,
-    choices_of,
-    plain_type,
-    range_of,
 )
 
 # Fields of earlier versions that no recipe and no study used, with their defaults.
@@ -57,62 +50,6 @@ RESEARCH = (
 ).split()
 # Former and shorter names of options.
 _OTHER_NAMES = {'total_steps': ('--steps',), 'simulation_threads': ('--threads',)}
-
-
-@dataclasses.dataclass(frozen=True, slots=True)
-class Field:
-    """One field of `TrainConfig`, for help texts and parsing.
-
-    Attributes:
-        meaning: Description of the field, on one line.
-        group: Title of its group in the help.
-    """
-
-    name: str
-    meaning: str
-    group: str
-
-    @property
-    def kind(self) -> Any:
-        """Type of the field, without its range."""
-        return plain_type(TYPES[self.name])
-
-    @property
-    def default(self) -> Any:
-        """Default of the field; None for `task`, which has no default."""
-        return DEFAULTS.get(self.name)
-
-    @property
-    def choices(self) -> tuple[str, ...]:
-        """Allowed values if the field has a fixed set of them, else an empty tuple."""
-        return choices_of(TYPES[self.name])
-
-    @property
-    def limits(self) -> Range | None:
-        """Allowed range if the field is a number with limits, else None."""
-        return range_of(TYPES[self.name])
-
-
-def _describe() -> dict[str, Field]:
-    """Return all fields by name, in the order of the groups.
-
-    Titles and descriptions are read from the docstrings in the source of `config.py`.
-    """
-    found = {}
-    groups = {each.__name__ for each in TrainConfig.__mro__[1:-1]}
-    for group in ast.parse(inspect.getsource(config)).body:
-        if not isinstance(group, ast.ClassDef) or group.name not in groups:
-            continue
-        title = (ast.get_docstring(group) or '').splitlines()[0].rstrip('.')
-        for field, below in itertools.pairwise(group.body):
-            match field, below:
-                case ast.AnnAssign(ast.Name(name)), ast.Expr(ast.Constant(str(text))):
-                    found[name] = Field(name, ' '.join(text.split()), title)
-    return found
-
-
-FIELDS = _describe()
-"""All fields by name, in the order of the groups."""
 
 
 def to_flat(config: TrainConfig) -> dict[str, Any]:

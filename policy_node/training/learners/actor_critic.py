@@ -121,15 +121,20 @@ class ActorCritic:
         }
 
     def set_progress(self, progress: float) -> None:
-        """Set the learning rate for this progress of the run; `progress` is clipped to 0 ... 1."""
-        config, share = self.config, min(max(progress, 0.0), 1.0)
-        rate = config.learning_rate * (1.0 - share * (1.0 - config.final_learning_rate))
+        """Set the learning rate of both networks for this progress of the run."""
         for optimizer in (self.actor_optimizer, self.critic_optimizer):
-            optimizer.param_groups[0]['lr'] = rate
+            set_learning_rate(optimizer, self.config, progress)
 
     def tensor(self, values: object) -> Tensor:
         """Return an array of a batch as a tensor on the device of the networks."""
         return torch.as_tensor(values).to(self.device, non_blocking=True)
+
+
+def set_learning_rate(optimizer: torch.optim.Adam, config: TrainConfig, progress: float) -> None:
+    """Set the learning rate for this progress of the run; `progress` is clipped to 0 ... 1."""
+    share = min(max(progress, 0.0), 1.0)
+    rate = config.learning_rate * (1.0 - share * (1.0 - config.final_learning_rate))
+    optimizer.param_groups[0]['lr'] = rate
 
 
 def network_shape(config: TrainConfig, extra_actions: int = 0) -> NetworkShape:

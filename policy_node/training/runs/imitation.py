@@ -24,6 +24,7 @@ from policy_node.policies.actor import Actor
 from policy_node.policies.policy import past_after
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.evaluation import EpisodeOutcomes, training_seeds
+from policy_node.training.learners.actor_critic import set_learning_rate
 from policy_node.training.learners.ddpg import Critic
 from policy_node.training.machine import Workers
 from policy_node.training.research.registry import network_shape
@@ -186,10 +187,7 @@ class ImitationTrainer(BaseTrainer):
     def _learn(self) -> float:
         """Fit the actor to the stored actions of the imitated policy; return the mean loss."""
         config, total = self.config, 0.0
-        left = max(1.0 - self.counters.env_steps / config.total_steps, 0.0)
-        share = config.final_learning_rate + (1.0 - config.final_learning_rate) * left
-        for group in self._optimizer.param_groups:
-            group['lr'] = config.learning_rate * share
+        set_learning_rate(self._optimizer, config, self._progress())
         for _ in range(config.updates_per_cycle):
             inputs, answers, *states = self._answers.draw(config.batch_size)
             actions = self.actor(inputs)
@@ -210,6 +208,6 @@ class ImitationTrainer(BaseTrainer):
         if not is_last and counters.env_steps < counters.next_evaluation:
             return None
         counters.next_evaluation = counters.env_steps + self.config.evaluate_every
-        outcomes = self._evaluator.evaluate(self.actor, -1.0)
+        outcomes = self._outcomes(self.actor)
         self._folder.keep_best(outcomes, self.actor, counters)
         return outcomes

@@ -14,14 +14,11 @@ from typing import Any
 import numpy as np
 
 from msgs_spec.text import one_line
-from node_runtime.command_line import (
-    complain,
-    complain_from_handler,
-)
+from node_runtime.command_line import complain, complain_from_handler
 from node_runtime.signals import on_stop_signals
 from node_runtime.source_revision import source_revision
 from policy_node.training.configuration.config import TrainConfig, idle_parts
-from policy_node.training.configuration.flat import config_from_dict, removed_fields, to_flat
+from policy_node.training.configuration.flat import config_from_dict, removed_fields
 from policy_node.training.experience.replay import Episodes
 from policy_node.training.machine import (
     available_memory,
@@ -50,11 +47,12 @@ from policy_node.training.runs.training_state import Counters, TrainingError, re
 OnCycle = Callable[[Row], object]
 AnyTrainer = Trainer | ImitationTrainer
 # Fields that a resumed run cannot change.
-_NETWORK_FIELDS = (
+_FIXED = (
     'hidden_sizes layer_norm goal_features algorithm critics quantiles norm advantage condition '
-    'longest_hold subgoal_every init_from'
+    'longest_hold subgoal_every init_from seed control_hz reward_type discount gamble'
 ).split()
-_EXPERIENCE_FIELDS = 'seed control_hz reward_type discount gamble'.split()
+# They end the run after the cycle.
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 @dataclass(slots=True)
@@ -113,8 +111,8 @@ def resumed_config(
     for name, value in removed_fields(stored).items():
         raise ValueError(f'{folder} was trained with {name} {value!r}, removed in version 2.0')
     before, config = config_from_dict(stored), config_from_dict(stored, **changes)
-    for name in (*_NETWORK_FIELDS, *_EXPERIENCE_FIELDS):
-        old, new = to_flat(before)[name], to_flat(config)[name]
+    for name in _FIXED:
+        old, new = getattr(before, name), getattr(config, name)
         if old != new:
             raise ValueError(f'{folder} has {name} {old!r}, which cannot change to {new!r}')
     return config
@@ -235,8 +233,15 @@ def _train(
             quiet=caller is not None and caller.quiet,
             on_row=_row_listener(trainer, caller),
         )
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        del frame
+        trainer.stop(f'stopped by {signal.Signals(number).name}')
+        complain_from_handler(NAME, 'stopping after this cycle; once more stops at once')
+
     try:
-        with _stop_on_signals(trainer, is_guest=caller is not None) as received:
+        # A second Ctrl-C raises KeyboardInterrupt in a program of a user and else ends the process.
+        with on_stop_signals(_SIGNALS, stop, raises_again=caller is not None) as received:
             reason = trainer.train(log)
     finally:
         if log is not None:
@@ -316,24 +321,3 @@ def lock_run(folder: Path) -> Iterator[None]:
         except OSError as error:
             complain(NAME, f'{folder} has no lock against other processes: {error.strerror}')
         yield
-
-
-@contextlib.contextmanager
-def _stop_on_signals(trainer: AnyTrainer, is_guest: bool = False) -> Iterator[list[int]]:
-    """Stop the run on Ctrl-C, SIGTERM or SIGHUP: after the cycle, or at once on the second signal.
-
-    Args:
-        is_guest: A second Ctrl-C raises KeyboardInterrupt instead of ending the process.
-
-    Yields:
-        A list to which the number of the received signal is added.
-    """
-
-    def stop(number: int, frame: FrameType | None) -> None:
-        del frame
-        trainer.stop(f'stopped by {signal.Signals(number).name}')
-        complain_from_handler(NAME, 'stopping after this cycle; once more stops at once')
-
-    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-    with on_stop_signals(numbers, stop, raises_again=is_guest) as received:
-        yield received

@@ -96,12 +96,14 @@ class RunFolder:
     def keep_best(self, outcomes: EpisodeOutcomes, actor: Actor, counters: Counters) -> None:
         """Save an evaluated actor if its success, or at equal success its return, is the highest.
 
-        `counters` gets the new best success and return.
+        `counters` gets the new best success and return. An evaluation that was cut short decides
+        nothing.
         """
         rule = self.config.success_rule
         success = success_rate(outcomes, rule)
         mean_return = float(outcomes.episode_return.mean())
-        if (success, mean_return) <= (counters.best_success, counters.best_return):
+        is_better = (success, mean_return) > (counters.best_success, counters.best_return)
+        if not is_better or len(outcomes) < self.config.evaluation_episodes:
             return
         counters.best_success, counters.best_return = success, mean_return
         if self.workers.is_first:

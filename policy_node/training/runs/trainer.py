@@ -25,7 +25,14 @@ from node_runtime.command_line import complain
 from policy_node.policies.actor import Actor
 from policy_node.policies.policy import Policy
 from policy_node.training.configuration.config import TrainConfig
-from policy_node.training.evaluation import EpisodeOutcomes, Evaluator, training_seeds
+from policy_node.training.evaluation import (
+    EVALUATION_SEED,
+    EpisodeOutcomes,
+    evaluate,
+    success_rate,
+    training_seeds,
+    wilson_interval,
+)
 from policy_node.training.experience.episode_files import load_replay
 from policy_node.training.experience.replay import Episodes
 from policy_node.training.learners.actor_critic import Losses
@@ -41,7 +48,6 @@ from policy_node.training.runs.run_log import Row, RunLog, evaluation_columns, l
 from policy_node.training.runs.training_state import (
     Counters,
     RunClock,
-    ended_by,
     fitting,
     load_networks,
     load_state,
@@ -97,21 +103,51 @@ class BaseTrainer:
         torch.set_num_threads(torch_threads)
         torch.manual_seed(config.seed)
         count = min(workers.share(config.num_envs), config.evaluation_episodes)
-        self._evaluator = Evaluator(self._simulate(config, count), config)
+        # In simulations of its own, an evaluation does not change the episodes of training.
+        self._evaluated = self._simulate(config, count)
         self.spec = task_spec(config.task, control_hz=config.control_hz)
         self._stop_reason = ''
 
     def _simulate(self, config: TrainConfig, count: int) -> Simulation:
         return make_simulation(config, count, self._threads)
 
+    def _progress(self) -> float:
+        """Return the share of the run that is done, 0 ... 1."""
+        return self.counters.env_steps / self.config.total_steps
+
     def stop(self, reason: str) -> None:
         """Make the run end after the current cycle, with a checkpoint; `reason` is in words."""
         self._stop_reason = reason
 
     def _reason_to_stop(self) -> str:
-        _, ended = ended_by(self.config, self.counters) or ('', '')
-        reason = self._stop_reason or ended
+        reason = self._stop_reason or (self._ended() or ('', ''))[1]
         return (reason or 'another worker stopped') if self.workers.any(bool(reason)) else ''
+
+    def _ended(self) -> tuple[str, str] | None:
+        """Return the field whose limit is reached, and the reason in words; else None."""
+        config, counters = self.config, self.counters
+        if 0 < config.success_target <= counters.best_success:
+            return 'success_target', f'success target {config.success_target:g} reached'
+        if counters.env_steps >= config.total_steps:
+            return 'total_steps', f'{config.total_steps:,} environment steps done'
+        if 0 < config.time_limit <= counters.seconds:
+            return 'time_limit', f'time limit of {config.time_limit:g} s reached'
+        return None
+
+    def _outcomes(self, policy: Policy, to_beat: float = -1.0) -> EpisodeOutcomes:
+        """Evaluate a policy on the same episodes each time.
+
+        The evaluation ends early once the success `to_beat` is above the 95 % interval.
+        """
+        rule = self.config.success_rule
+
+        def is_hopeless(outcomes: EpisodeOutcomes) -> bool:
+            count = len(outcomes)
+            successes = round(success_rate(outcomes, rule) * count)
+            return wilson_interval(successes, count)[1] < to_beat
+
+        episodes = self.config.evaluation_episodes
+        return evaluate(self._evaluated, policy, episodes, EVALUATION_SEED, is_hopeless)
 
     def _row(
         self, train_success: float, outcomes: EpisodeOutcomes | None, samples: int, seconds: float
@@ -170,7 +206,6 @@ class Trainer(BaseTrainer):
             self._let_critic_learn_first()
         self._part_noise()
         self._steps_to_refill = 0
-        self._clock = RunClock(self.counters)
 
     def modules(self) -> dict[str, nn.Module]:
         """Return networks and normalizer statistics by their names in a training state."""
@@ -210,7 +245,7 @@ class Trainer(BaseTrainer):
         soonest = counters.env_steps + self.config.evaluate_every
         counters.next_evaluation = min(counters.next_evaluation, soonest)
         self._part_noise()
-        self._narrow()
+        self.experience.narrow(self._progress())
         origin = state.extra.get('init_from', {})
         self._folder.init_from = origin
         self._let_critic_learn_first()
@@ -304,11 +339,13 @@ class Trainer(BaseTrainer):
         if collected.evaluation is None and is_trained and self._ended():
             # Evaluate the last actor.
             collected = executor.submit(self._evaluate, collected, self._candidate()).result()
-        self._keep_best(collected)
+        outcomes, actor = collected.evaluation, collected.evaluated
+        if outcomes and actor:
+            self._folder.keep_best(outcomes, actor, self.counters)
         if log is not None:
             samples = len(losses) * self.experience.batch_size * self.workers.world_size
             success, seconds = collected.train_success, time.monotonic() - before
-            row = self._row(success, collected.evaluation, samples, seconds)
+            row = self._row(success, outcomes, samples, seconds)
             log.write({**row, **loss_columns(losses), **collected.others})
         return collected
 
@@ -367,13 +404,13 @@ class Trainer(BaseTrainer):
         if candidate is None:
             return collected
         actor, others = candidate
-        outcomes = self._evaluator.evaluate(actor, self.counters.best_success)
-        rates = {column: self._evaluator.success_of(policy) for column, policy in others.items()}
+        outcomes, rule = self._outcomes(actor, self.counters.best_success), self.config.success_rule
+        rates = {name: success_rate(self._outcomes(each), rule) for name, each in others.items()}
         return replace(collected, evaluation=outcomes, evaluated=actor, others=rates)
 
     def _exploration(self) -> float:
         """Return the factor on exploration noise and random actions for now, 0 ... 1."""
-        left = 3.0 * (1.0 - self.counters.env_steps / self.config.total_steps)
+        left = 3.0 * (1.0 - self._progress())
         final = self.config.final_exploration
         return final + (1.0 - final) * min(max(left, 0.0), 1.0)
 
@@ -393,11 +430,7 @@ class Trainer(BaseTrainer):
         self.counters.episodes += int(count)
         self.counters.env_steps += int(count) * self.spec.episode_ticks
         self.experience.normalize(episodes, self.learner.actor)
-        self._narrow()
-
-    def _narrow(self) -> None:
-        """Set the success thresholds of the reward for the progress of the run."""
-        self.experience.narrow(self.counters.env_steps / self.config.total_steps)
+        self.experience.narrow(self._progress())
 
     def _learn(self) -> list[Losses]:
         first = self.workers.share(self.config.learning_starts) if self.counters.updates == 0 else 0
@@ -406,7 +439,7 @@ class Trainer(BaseTrainer):
         if self.workers.any(self.experience.transitions < max(first, 1)):
             return []
         steps = self.counters.env_steps
-        self.learner.set_progress(steps / self.config.total_steps)
+        self.learner.set_progress(self._progress())
         losses = [
             self.learner.update(self.experience.batch(steps))
             for _ in range(self.config.updates_per_cycle)
@@ -420,17 +453,6 @@ class Trainer(BaseTrainer):
             named += [(f'{part}.{n}', value.cpu()) for n, value in module.state_dict().items()]
         require_finite(named, self.counters)
         return losses
-
-    def _keep_best(self, collected: Collected) -> None:
-        outcomes, actor = collected.evaluation, collected.evaluated
-        if outcomes is None or actor is None:
-            return
-        if len(outcomes) >= self.config.evaluation_episodes:
-            self._folder.keep_best(outcomes, actor, self.counters)
-
-    def _ended(self) -> tuple[str, str] | None:
-        """Return the field whose limit is reached, and the reason in words; else None."""
-        return ended_by(self.config, self.counters)
 
     def save(self) -> None:
         """Write a checkpoint: the newest episodes and, on the first worker, latest actor and state.

@@ -22,7 +22,6 @@ from policy_node.policies.files import (
     tensor_bytes,
     write_file,
 )
-from policy_node.training.configuration.config import Limits
 from policy_node.training.learners.actor_critic import ActorCritic
 
 FORMAT = 'fetch_hand_training'
@@ -56,17 +55,6 @@ class Counters:
     best_success: float = -1.0
     best_return: float = -1e9
     next_evaluation: int = 0
-
-
-def ended_by(limits: Limits, counters: Counters) -> tuple[str, str] | None:
-    """Return the field whose limit is reached, and the reason in words; else None."""
-    if 0 < limits.success_target <= counters.best_success:
-        return 'success_target', f'success target {limits.success_target:g} reached'
-    if counters.env_steps >= limits.total_steps:
-        return 'total_steps', f'{limits.total_steps:,} environment steps done'
-    if 0 < limits.time_limit <= counters.seconds:
-        return 'time_limit', f'time limit of {limits.time_limit:g} s reached'
-    return None
 
 
 class RunClock:

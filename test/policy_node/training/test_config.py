@@ -11,9 +11,8 @@ import pytest
 
 from msgs_spec.tasks import TASKS
 from node_runtime.command_line import CommandParser
-from policy_node.training.configuration.config import idle_parts
+from policy_node.training.configuration.config import FIELDS, idle_parts
 from policy_node.training.configuration.flat import (
-    FIELDS,
     RESEARCH,
     add_field_options,
     changed,

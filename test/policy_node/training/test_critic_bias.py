@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from policy_node.training.critic_bias import main
-from policy_node.training.critic_bias import discounted, measure
+from policy_node.training.critic_bias import discounted, main, measure
 from support.runs import trainer_of
 
 

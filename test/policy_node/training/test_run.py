@@ -21,6 +21,7 @@ import torch
 from fetch_hand_sim.datasets.writing import alone_in
 from policy_node.policies import checkpoint
 from policy_node.policies.files import read_tensors
+from policy_node.training import evaluation
 from policy_node.training.experience.episode_files import load_replay, save_replay
 from policy_node.training.experience.replay import EpisodeReplay
 from policy_node.training.runs.run import lock_run
@@ -165,13 +166,12 @@ def test_the_last_evaluation_is_of_the_last_actor(tmp_path, monkeypatch, overlap
     """With `overlap`, an evaluation due in the last cycle would run beside the learner."""
     trainer = trainer_of(tmp_path, total_steps=1_200, overlap=overlap)
     evaluated = []
-    measure = trainer._evaluator.evaluate
 
-    def evaluate(actor, best_success):
+    def evaluate(simulation, actor, *options):
         evaluated.append(actor)
-        return measure(actor, best_success)
+        return evaluation.evaluate(simulation, actor, *options)
 
-    monkeypatch.setattr(trainer._evaluator, 'evaluate', evaluate)
+    monkeypatch.setattr('policy_node.training.runs.trainer.evaluate', evaluate)
     log = StopAfter(trainer)
     trainer.train(log)
     last, now = evaluated[-1].state_dict(), trainer.learner.evaluation_actor().state_dict()

@@ -21,7 +21,6 @@ from policy_node.training.experience.rewards import GradedReward
 from policy_node.training.generate_episodes import main as generate_episodes
 from policy_node.training.runs.run import train_run
 from policy_node.training.runs.run_log import read_progress
-from policy_node.training.runs.trainer import Collected
 from policy_node.training.runs.training_state import TrainingError, read_state
 from policy_node.training.ship_actor import main as ship_actor
 from policy_node.training.train_her import main
@@ -316,7 +315,6 @@ def test_an_observation_that_is_not_finite_stops_the_run(tmp_path):
 
 def test_the_best_actor_is_kept_and_ties_go_to_the_better_return(tmp_path):
     trainer = trainer_of(tmp_path, evaluation_episodes=4)
-    episodes, success = trainer.collector.collect(trainer.learner.actor)
 
     def evaluated(steps, successes, mean_return, count=4):
         flags = np.arange(count) < successes
@@ -328,7 +326,7 @@ def test_the_best_actor_is_kept_and_ties_go_to_the_better_return(tmp_path):
         )
         trainer.counters.env_steps = steps
         actor = trainer.learner.evaluation_actor()
-        trainer._keep_best(Collected(episodes, success, outcomes, actor))
+        trainer._folder.keep_best(outcomes, actor, trainer.counters)
         return checkpoint.read_info(tmp_path / 'best.safetensors').env_steps
 
     assert evaluated(1, 2, -9.0) == 1
