@@ -139,24 +139,6 @@ def test_invalid_state_is_refused_and_the_next_tick_answered(case):
     assert (responder.unusable, len(wire.sent)) == (3, 2)
 
 
-def test_clock_jumps(case):
-    responder, wire, ticks = case
-
-    def feed_at(stamp):
-        names = [source.name for source in responder.topics]
-        feed(responder, {name: moved(ticks[0], name, stamp) for name in names})
-
-    second = 10**9
-    for stamp in (second, 2_000_000_000 * second, 5 * second, 5 * second + 40_000_000):
-        feed_at(stamp)
-    assert len(wire.sent) == 4
-    feed_at(5 * second - 40_000_000)  # late, not a new beginning
-    assert len(wire.sent) == 4
-    responder.forget()  # the robot starts
-    feed_at(5 * second - 40_000_000)
-    assert len(wire.sent) == 5
-
-
 def test_hostile_bytes_are_refused_in_one_line_and_counted(case, hostile_count):
     responder, wire, ticks = case
     generator = np.random.default_rng(3)
@@ -193,17 +175,24 @@ def test_join_keeps_a_bounded_number_of_incomplete_stamps():
     assert join.dropped == 10_000 - 8
 
 
-def test_an_earlier_stamp_is_late_only_for_a_while():
-    """A restarted robot can begin shortly before the last stamp."""
-    now = [0.0]
+def test_an_earlier_stamp_is_late_for_a_while_or_a_restart():
+    now, second = [0.0], 10**9
     join = StampJoin(['a'], clock=lambda: now[0])
-    assert join.add('a', 2_000_000_000, np.zeros(1)) is not None
-    assert join.add('a', 1_960_000_000, np.zeros(1)) is None
-    now[0] = 1.5
-    # Repeated for new subscribers.
-    assert join.add('a', 2_000_000_000, np.zeros(1)) is None
-    assert join.add('a', 1_000_000_000, np.zeros(1)) is not None
-    assert join.add('a', 1_040_000_000, np.zeros(1)) is not None
+    late, last = 5 * second - 40_000_000, 5 * second
+    for now[0], stamp, is_complete in (
+        (0.0, second, True),
+        (0.0, 2 * 10**9 * second, True),
+        # Far back is a restart at once; shortly before the last stamp only later.
+        (0.0, last, True),
+        (0.0, late, False),
+        (1.5, last, False),
+        (1.5, late, True),
+        (1.5, last, True),
+        (1.5, late, False),
+    ):
+        assert (join.add('a', stamp, np.zeros(1)) is not None) == is_complete, (now, stamp)
+    join.forget()
+    assert join.add('a', late, np.zeros(1)) is not None
 
 
 def test_a_policy_of_another_rate_is_refused(episode):

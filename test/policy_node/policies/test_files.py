@@ -14,7 +14,7 @@ import sys
 from pathlib import Path
 from policy_node.policies.files import write_files
 file, letter = Path(sys.argv[1]), sys.argv[2].encode()
-for _ in range(60):
+for _ in range(25):
     write_files({file: letter * 100_000})
 """
 
