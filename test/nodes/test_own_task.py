@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import os
-import signal
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from test_nodes import episodes_in, finish
 
 from support import ROOT
-from support.graph import POLICY_NODE, SIM_NODE, ros_args
+from support.graph import POLICY_NODE, SIM_NODE, Start, end, episodes_in, finish, ros_args
 from support.shell_lines import commands, python_blocks, shell_lines
 
-Start = Callable[..., subprocess.Popen[str]]
 EXAMPLE = ROOT / 'examples' / 'fetch_reach_oriented'
 TASK = 'FetchReachOriented'
 
@@ -37,9 +33,17 @@ def environment(site: Path) -> dict[str, str]:
     return os.environ | {'PYTHONPATH': os.pathsep.join([str(ROOT), str(site)])}
 
 
-def run(site: Path, *command: object) -> subprocess.CompletedProcess[str]:
+def run(site: Path, *command: object, **options: object) -> subprocess.CompletedProcess[str]:
     words = [sys.executable, *(str(word) for word in command)]
-    return subprocess.run(words, env=environment(site), capture_output=True, text=True)
+    return subprocess.run(words, env=environment(site), capture_output=True, text=True, **options)
+
+
+def install(site: Path, name: str, entry_points: str) -> None:
+    """Writes what pip would write about a package with these entry points."""
+    folder = site / f'{name}-1.dist-info'
+    folder.mkdir()
+    (folder / 'METADATA').write_text(f'Metadata-Version: 2.1\nName: {name}\nVersion: 1\n')
+    (folder / 'entry_points.txt').write_text(entry_points)
 
 
 def test_the_policys_side_reads_it_without_mujoco(site: Path) -> None:
@@ -120,24 +124,18 @@ assert main(['train', *training, *fast, '--output', 'run']) == 0
 def test_the_pages_other_reward_trains_and_is_checked(tmp_path: Path) -> None:
     blocks = python_blocks((ROOT / 'docs' / 'own_reward.md').read_text())
     specification, simulation = (block for block in blocks if 'FetchPushNear' in block)
-    package, names = tmp_path / 'near', tmp_path / 'near-1.dist-info'
-    for folder in (package, names):
-        folder.mkdir()
+    package = tmp_path / 'near'
+    package.mkdir()
     (package / '__init__.py').touch()
     (package / 'specification.py').write_text(specification)
     (package / 'simulation.py').write_text(simulation)
-    (names / 'METADATA').write_text('Metadata-Version: 2.1\nName: near\nVersion: 1\n')
-    (names / 'entry_points.txt').write_text(
+    install(
+        tmp_path,
+        'near',
         '[fetch_hand_sim_tasks.specification]\nFetchPushNear = near.specification:SPECIFICATION\n'
-        '[fetch_hand_sim_tasks.simulation]\nFetchPushNear = near.simulation:FetchPushNear\n'
+        '[fetch_hand_sim_tasks.simulation]\nFetchPushNear = near.simulation:FetchPushNear\n',
     )
-    result = subprocess.run(
-        [sys.executable, '-c', ANOTHER_REWARD],
-        cwd=tmp_path,
-        env=environment(tmp_path),
-        capture_output=True,
-        text=True,
-    )
+    result = run(tmp_path, '-c', ANOTHER_REWARD, cwd=tmp_path)
     assert result.returncode == 0, result.stderr
     assert result.stdout.startswith('True FetchPushNear')
 
@@ -209,17 +207,13 @@ def test_it_is_trained_run_by_the_nodes_logged_checked_and_replayed(
     arguments = ros_args(path=episode.path, rate=10.0, wait_for_commands=True)
     code, output = finish(start_process(*replay, *arguments, env=os_environment), timeout=60.0)
     assert code == 0, output
-    policy.send_signal(signal.SIGINT)
-    assert finish(policy)[0] == 0
+    end(policy)
 
 
 def test_a_broken_package_costs_one_warning_and_its_own_task(tmp_path: Path) -> None:
     (tmp_path / 'broken_task.py').write_text("raise RuntimeError('no such\\nrobot')\n")
-    info = tmp_path / 'broken_task-1.dist-info'
-    info.mkdir()
-    (info / 'METADATA').write_text('Metadata-Version: 2.1\nName: broken-task\nVersion: 1\n')
     entry = '[fetch_hand_sim_tasks.specification]\nMine = broken_task:Mine\n'
-    (info / 'entry_points.txt').write_text(entry)
+    install(tmp_path, 'broken-task', entry)
     code = 'import fetch_hand_sim; from msgs_spec.tasks import TASKS; print(len(TASKS))'
     result = run(tmp_path, '-c', code)
     assert result.stdout == '13\n'

@@ -5,9 +5,7 @@
 
 from __future__ import annotations
 
-import subprocess
 import sys
-from collections.abc import Callable
 
 import mujoco
 import numpy as np
@@ -21,9 +19,8 @@ from msgs_spec.tasks import task_spec
 from msgs_spec.topics import INTERFACE_SERVICES, MAX_STEPS, QosSpec, topic
 from node_runtime.ros import rclpy_profile, ros_message_class, ros_service_class
 from support.frames import tree
-from support.graph import POLICY_NODE, SIM_NODE, client, end, ros_args
+from support.graph import POLICY_NODE, SIM_NODE, Start, client, end, ros_args
 
-Start = Callable[..., subprocess.Popen[str]]
 VISUALIZATION = (sys.executable, '-m', 'fetch_hand_sim.visualization_node')
 # As the listeners of tf2 ask for.
 LISTENING = QosSpec(depth=100, reliability='reliable', durability='volatile')

@@ -81,11 +81,14 @@ def test_the_sdist_holds_all_that_is_tracked(built: Path) -> None:
     assert all(name.endswith('.training.safetensors') for name in left_out)
 
 
-def test_the_metadata_are_complete(metadata) -> None:
+def test_the_metadata_are_complete_and_the_base_installation_is_small(metadata) -> None:
     assert metadata['Requires-Python'] == '>=3.11'
     assert metadata['Description-Content-Type'] == 'text/markdown'
     assert metadata.get_payload().startswith('# fetch_hand_sim')
     assert metadata.get_all('Project-URL') and len(metadata.get_all('Classifier')) > 5
+    base = [each for each in metadata.get_all('Requires-Dist') if 'extra ==' not in each]
+    heavy = ('torch', 'pyarrow', 'tensorboard', 'matplotlib', 'ray', 'ros-jazzy', 'onnx', 'stable')
+    assert base and not [each for each in base if each.startswith(heavy)]
 
 
 def imported_packages() -> set[str]:
@@ -113,12 +116,6 @@ def test_package_xml_names_every_ros_package_that_is_imported() -> None:
     assert imported_packages() & set(ROS) <= depends
 
 
-def test_the_base_installation_is_small(metadata) -> None:
-    base = [each for each in metadata.get_all('Requires-Dist') if 'extra ==' not in each]
-    heavy = ('torch', 'pyarrow', 'tensorboard', 'matplotlib', 'ray', 'ros-jazzy', 'onnx', 'stable')
-    assert base and not [each for each in base if each.startswith(heavy)]
-
-
 def test_all_versions_are_one(metadata) -> None:
     citation = yaml.safe_load((ROOT / 'CITATION.cff').read_text())
     versions = {metadata['Version'], parse_package(ROOT / 'package.xml').version}
@@ -130,25 +127,25 @@ def test_all_versions_are_one(metadata) -> None:
     assert version > released if '- ' in news else version == released
 
 
-def test_package_xml_is_valid() -> None:
+def test_package_xml_is_valid_and_agrees_with_setup_py(metadata) -> None:
     warnings: list[str] = []
     package = parse_package(ROOT / 'package.xml', warnings=warnings)
     package.validate(warnings=warnings)
     assert warnings == []
     assert package.package_format == 3 and package.urls
-    assert [license_.file for license_ in package.licenses] == ['LICENSE']
+    (license_,) = package.licenses
+    assert (package.name, license_.file) == (metadata['Name'], 'LICENSE')
+    assert str(license_) == (metadata['License-Expression'] or metadata['License'])
+    assert 'Apache License' in (ROOT / 'LICENSE').read_text()
 
 
-def test_hooks_run_the_checks_of_make_lint() -> None:
+def test_hooks_run_the_checks_of_make_lint_and_hosted_checks_make_test() -> None:
     """The same tools over the same files: a commit that passes the hooks passes `make lint`."""
     hooks = yaml.safe_load((ROOT / '.pre-commit-config.yaml').read_text())['repos'][0]['hooks']
     makefile = (ROOT / 'Makefile').read_text()
     recipe = makefile.partition('\nlint: env\n')[2].partition('\n\n')[0]
     linted = [line.split('-m ')[1].replace(' $(PYTHON_FILES)', '') for line in recipe.splitlines()]
     assert [hook['entry'].split('-m ')[1] for hook in hooks] == linted
-
-
-def test_hosted_checks_are_make_test() -> None:
     workflow = yaml.safe_load((ROOT / '.github/workflows/test.yml').read_text())
     steps = workflow['jobs']['test']['steps']
     assert [step['run'] for step in steps if 'run' in step] == ['make test']

@@ -157,21 +157,13 @@ class Browser:
 
     def move(self, x: float, y: float, pressed: bool = False) -> None:
         button = {'button': 'left', 'buttons': 1} if pressed else {'button': 'none', 'buttons': 0}
-        self.call(
-            'Input.dispatchMouseEvent',
-            type='mouseMoved',
-            x=x,
-            y=y,
-            modifiers=self._modifiers,
-            **button,
-        )
-        self.wait(0.1)
+        self._mouse('mouseMoved', x, y, 0.1, **button)
 
     def press(self, x: float, y: float) -> None:
-        self._button('mousePressed', x, y, 1)
+        self._mouse('mousePressed', x, y, 0.25, button='left', buttons=1, clickCount=1)
 
     def release(self, x: float, y: float) -> None:
-        self._button('mouseReleased', x, y, 0)
+        self._mouse('mouseReleased', x, y, 0.25, button='left', buttons=0, clickCount=1)
 
     def press_key(self, key: str) -> None:
         """Presses a key and holds it: `Control` or one of the arrows."""
@@ -199,18 +191,10 @@ class Browser:
         self.press(x, y)
         self.release(x, y)
 
-    def _button(self, kind: str, x: float, y: float, buttons: int) -> None:
-        self.call(
-            'Input.dispatchMouseEvent',
-            type=kind,
-            x=x,
-            y=y,
-            button='left',
-            buttons=buttons,
-            clickCount=1,
-            modifiers=self._modifiers,
-        )
-        self.wait(0.25)
+    def _mouse(self, kind: str, x: float, y: float, pause: float, **fields: Any) -> None:
+        fields |= {'type': kind, 'x': x, 'y': y, 'modifiers': self._modifiers}
+        self.call('Input.dispatchMouseEvent', **fields)
+        self.wait(pause)
 
     def close(self) -> None:
         if self._process.poll() is None:
