@@ -166,7 +166,9 @@ def test_a_job_of_another_process_is_left_alone(
 
 
 @pytest.mark.release
-def test_a_job_whose_end_was_not_saved_is_not_finished(tmp_path: Path) -> None:
+def test_a_job_whose_end_was_not_saved_is_not_finished_and_keeps_its_settings(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """The log is ahead where the last checkpoint failed, or where a kill came before it."""
     arguments = small(tmp_path, '--arms', 'her_sparse')
     assert main(arguments) == 0
@@ -181,15 +183,8 @@ def test_a_job_whose_end_was_not_saved_is_not_finished(tmp_path: Path) -> None:
     assert main(arguments) == 0
     assert is_finished(job, tmp_path) and read_counters(state).env_steps == 1200
     assert read_info(job.folder / 'latest.safetensors').env_steps == 1200
-
-
-@pytest.mark.release
-def test_another_budget_in_the_same_folder_is_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(small(tmp_path, '--arms', 'her_sparse')) == 0
     capsys.readouterr()
-    assert main(small(tmp_path, '--arms', 'her_sparse', '--set', 'batch_size=32')) == 2
+    assert main([*arguments, '--set', 'batch_size=32']) == 2
     error = capsys.readouterr().err
     assert 'contains a run with batch_size 64, now 32. Choose another --output.' in error
     assert error.count('\n') == 1
@@ -210,6 +205,12 @@ def test_another_budget_in_the_same_folder_is_refused(
         (['--study', 'best', '--arms', 'her_sparse'], "'her_sparse'; allowed in best: best"),
         (['--study', 'goals', '--actors', 'x'], '--actors belongs to --study best'),
         (['--set', 'init_from=FetchReach'], '--set init_from is not possible'),
+        (['--study', 'unbiased', '--arms', 'ddpg'], "'ddpg'; allowed in unbiased: future, "),
+        (
+            ['--study', 'unbiased', '--tasks', 'FetchSlide'],
+            'FetchSlide; allowed in unbiased: Fetch',
+        ),
+        (['--study', 'unbiased', '--set', 'goals=final=1'], '--set goals is not possible: jobs'),
         (['--set', 'time_limit=2'], '--set time_limit is not possible: a job ends when its steps'),
         (['--set', 'success_target=.9'], '--set success_target is not possible: a job ends when'),
     ],

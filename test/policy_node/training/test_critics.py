@@ -1,4 +1,4 @@
-"""Ensembles, their normalisation and their word as one, on problems with a known answer."""
+"""Ensembles, their normalisation and their common targets, on problems with a known answer."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from policy_node.training.configuration.config import Critics
 from policy_node.training.experience.replay import Transitions
 from policy_node.training.learners.ddpg import DDPG
 from policy_node.training.research.critics import (
-    AGGREGATES,
     Ensemble,
     critic_loss,
     quantile_costs,
@@ -22,15 +21,6 @@ from policy_node.training.research.judged import bellman, uncertain
 from support.learners import SHAPE, make_learner
 
 torch.set_num_threads(1)
-
-
-@pytest.mark.parametrize(
-    ('name', 'expected'),
-    [('mean', [-3.0, -2.0]), ('min', [-5.0, -2.5]), ('truncated', [-4.0, -2.25])],
-)
-def test_what_an_ensemble_says_as_one(name: str, expected: list[float]) -> None:
-    values = torch.tensor([[-1.0, -2.0], [-5.0, -2.5], [-3.0, -1.5]])
-    torch.testing.assert_close(AGGREGATES[name](values), torch.tensor(expected))
 
 
 def test_members_start_differently_and_have_an_axis_of_their_own() -> None:
@@ -79,12 +69,6 @@ def test_values_of_a_chain_are_its_discounted_rewards(changes: dict[str, object]
     # The average: without target networks batch normalisation keeps them moving by 0.2.
     atol = 0.2 if changes.get('norm') == 'batch' else 0.15
     np.testing.assert_allclose(np.mean(seen, axis=0), [-1.5, -1.0, 0.0, 0.0], atol=atol)
-
-
-def test_without_target_networks_there_are_none_to_move() -> None:
-    learner = make_learner(target='none')
-    assert learner.target_critic is learner.critic
-    learner.update(chain_batch(64, np.random.default_rng(0)))
 
 
 # Of observation, goal and action: what the critics are, and what their slow copies are.
@@ -174,6 +158,7 @@ def test_a_batch_norm_sees_states_and_next_states_together() -> None:
     """CrossQ: statistics of one pass over both, and none of any other pass."""
     shape = NetworkShape(1, 1, 1, (6,))
     learner = make_learner(shape, norm='batch', target='none', action_l2=0.0, learning_rate=0.0)
+    assert learner.target_critic is learner.critic
     linear, norm, _ = learner.critic.network.hidden
     output = learner.critic.network.output
     with torch.no_grad():
@@ -219,31 +204,6 @@ def test_a_batch_norm_sees_states_and_next_states_together() -> None:
     np.testing.assert_allclose(norm.running_var, variance, rtol=1e-5)
     expected = values(hidden(features, own), mean, variance).mean()
     assert losses.value.item() == pytest.approx(expected, rel=1e-4)
-
-
-def lottery(count, generator):
-    """One state, one step: the return is -1 nine times of ten and else -9."""
-    reward = np.where(generator.random(count) < 0.9, -1.0, -9.0).astype(np.float32)
-    same = np.ones((count, 1), np.float32)
-    action = generator.uniform(-1, 1, (count, 1)).astype(np.float32)
-    return Transitions(same, same, same, action, reward, np.zeros(count, np.float32))
-
-
-@pytest.mark.release
-def test_the_quantiles_of_a_lottery_are_learnt_and_its_mean_with_them():
-    learner = make_learner(quantiles=5, gamma=0.95)
-    generator = np.random.default_rng(0)
-    for _ in range(1500):
-        learner.update(lottery(256, generator))
-    one = torch.ones(1, 1)
-    features = learner.actor.features(one, one)
-    with torch.no_grad():
-        found = learner.critic.outputs(features, one)[0]
-        value = learner.critic(features, one)
-    # Of five equal shares the lowest is -9 in half of its width: its middle lies on the step.
-    torch.testing.assert_close(found[1:], torch.full((4,), -1.0), atol=0.3, rtol=0.0)
-    assert -9.2 < float(found[0]) < -1.0
-    assert float(value) == float(found.mean())
 
 
 def test_truncated_targets_leave_out_the_highest_of_all_critics_together():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 
 import numpy as np
@@ -12,13 +13,15 @@ from safetensors.numpy import load_file, save_file
 
 from policy_node.policies.files import read_tensors, write_tensors
 from policy_node.policies.loading import shipped_actors
+from policy_node.training.experience.episode_files import load_replay
+from policy_node.training.experience.replay import EpisodeReplay
 from policy_node.training.machine import available_memory
 from policy_node.training.runs import run as run_module
 from policy_node.training.runs.initial_networks import read_initial_networks
 from policy_node.training.runs.run_log import read_progress
 from policy_node.training.runs.training_state import read_counters
 from policy_node.training.train_her import main
-from support.runs import SMALL, STATE, one_line, options_of, trained
+from support.runs import SMALL, STATE, one_line, options_of, resumed, trained
 
 FIELDS = SMALL | {'hidden_sizes': (16, 16)}
 REPLAY, BEST = 'replay.safetensors', 'best.safetensors'
@@ -65,12 +68,11 @@ def refusal(run, capsys, *more):
         ({'zzz': 1}, "'zzz'"),
     ],
 )
-def test_invalid_counters_are_rejected(run, counters, message, capsys):
+def test_invalid_counters_are_rejected(run, counters, message):
     change_state(run, counters=counters)
-    error = refusal(run, capsys)
-    assert message in error and str(run / STATE) in error
-    with pytest.raises(ValueError, match='unreadable metadata'):
+    with pytest.raises(ValueError, match=re.escape(message)) as raised:
         read_counters(run / STATE)
+    assert f'{run / STATE} has unreadable metadata: ' in str(raised.value)
 
 
 def test_an_invalid_origin_is_rejected(run, capsys):
@@ -113,9 +115,10 @@ def without(prefix):
         (shorter('actor.network.output.bias'), 'Actor: size mismatch for network.output.bias'),
     ],
 )
-def test_invalid_tensors_are_rejected(run, change, message, capsys):
+def test_invalid_tensors_are_rejected(run, change, message):
     change_state(run, change)
-    assert message in refusal(run, capsys)
+    with pytest.raises(ValueError, match=re.escape(message)):
+        resumed(run, hidden_sizes=(16, 16))
 
 
 def test_an_actor_is_no_training_state(run, capsys):
@@ -139,30 +142,32 @@ def test_no_run_starts_from_networks_that_are_not_finite(run):
         ('action', lambda a: np.zeros((), np.float32).reshape(1)[0:1], 'observation is (24, 51'),
     ],
 )
-def test_an_invalid_replay_is_collected_again(run, name, change, message, capsys):
+def test_an_invalid_replay_is_rejected(run, name, change, message):
     tensors = load_file(run / REPLAY)
     save_file(tensors | {name: change(tensors[name])}, run / REPLAY)
-    assert main(['--resume', str(run), '--steps', '1600']) == 0
-    error = capsys.readouterr().err
-    assert f'is no replay of this run: {message}' in error
-    assert '1,200 steps fill the replay' in error
+    with pytest.raises(ValueError, match=re.escape(f'is no replay of this run: {message}')):
+        load_replay(run / REPLAY, EpisodeReplay(24, 50, 10, 3, 4))
 
 
-@pytest.mark.parametrize('content', [bytes(range(256)) * 10, b'env_steps\n9999\n'])
-def test_an_invalid_log_does_not_stop_a_run(run, content, capsys):
-    (run / 'progress.csv').write_bytes(content)
-    assert main(['--resume', str(run), '--steps', '1600']) == 0
-    assert [row['env_steps'] for row in read_progress(run / 'progress.csv')] == [1_600]
-    assert 'Traceback' not in capsys.readouterr().err
-
-
-@pytest.mark.parametrize('there', [None, shipped_actors()['FetchPush'].read_bytes()])
-def test_a_missing_best_actor_is_replaced(run, there, capsys):
+@pytest.mark.parametrize(
+    ('log', 'best'),
+    [
+        (bytes(range(256)) * 10, None),
+        (b'env_steps\n9999\n', shipped_actors()['FetchPush'].read_bytes()),
+    ],
+)
+def test_an_invalid_log_best_actor_or_curve_does_not_stop_a_run(run, log, best, capsys):
     change_state(run, counters={'best_success': 1.0, 'best_return': 0.0})
-    (run / BEST).unlink() if there is None else (run / BEST).write_bytes(there)
+    (run / 'progress.csv').write_bytes(log)
+    (run / BEST).unlink() if best is None else (run / BEST).write_bytes(best)
+    (run / 'curve.png').unlink(missing_ok=True)
+    (run / 'curve.png').mkdir()
     assert main(['--resume', str(run), '--steps', '1600']) == 0
-    assert 'the next evaluated actor replaces it' in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert 'the next evaluated actor replaces it' in said and 'Traceback' not in said
+    assert 'no curve, the run itself is saved: ' in said
     assert read_tensors(run / BEST)[1]['task'] == '"FetchReach"'
+    assert [row['env_steps'] for row in read_progress(run / 'progress.csv')] == [1_600]
 
 
 @pytest.mark.parametrize(
@@ -172,19 +177,11 @@ def test_a_missing_best_actor_is_replaced(run, there, capsys):
         {'episodes': 1000, 'rule': 'gymnasium', 'mean_return': None, 'last_step': 0.5},
     ],
 )
-def test_a_best_actor_with_an_invalid_evaluation_has_no_effect(run, success, capsys):
+def test_a_best_actor_with_an_invalid_evaluation_has_no_effect(run, success):
     tensors, metadata = read_tensors(run / BEST)
     write_tensors(run / BEST, tensors, metadata | {'success': json.dumps(success)})
-    assert main(['--resume', str(run), '--steps', '1600']) == 0
-    said = capsys.readouterr()
-    assert 'Traceback' not in said.err and 'best success 5' not in said.out
-
-
-def test_a_curve_with_no_place_does_not_fail_the_run(run, capsys):
-    (run / 'curve.png').unlink(missing_ok=True)
-    (run / 'curve.png').mkdir()
-    assert main(['--resume', str(run), '--steps', '1600']) == 0
-    assert 'no curve, the run itself is saved: ' in capsys.readouterr().err
+    counters = resumed(run, hidden_sizes=(16, 16)).counters
+    assert counters.best_success == read_counters(run / STATE).best_success < 5
 
 
 def test_a_folder_without_a_run_is_rejected(run, capsys):
@@ -223,9 +220,8 @@ def test_a_replay_that_will_exceed_the_memory_is_reported_at_the_start(
     # A step of FetchReach is 10 + 3 + 4 numbers of 4 bytes; an episode has one observation more and
     # a goal.
     whole = 16 * (51 * 13 + 3 + 50 * 4) * 4
-    arguments = ['--task', 'FetchReach', '--steps', '800', '--set', 'num_envs=2']
-    arguments += ['--threads', '1', '--torch-threads', '1', '--set', 'updates_per_cycle=1']
-    arguments += ['--set', 'evaluation_episodes=2']
+    fields = FIELDS | {'total_steps': 800, 'num_envs': 2}
+    arguments = ['--task', 'FetchReach', *options_of(**fields)]
     for available, warns in ((whole, False), (whole - 1, True), (None, False)):
         monkeypatch.setattr(run_module, 'available_memory', lambda available=available: available)
         assert main([*arguments, '--output', str(tmp_path / str(available))]) == 0
@@ -237,11 +233,9 @@ def test_a_processor_that_emulates_bfloat16_is_reported(
     tmp_path, monkeypatch, capsys, is_supported
 ):
     monkeypatch.setattr('torch.cpu._is_avx512_bf16_supported', lambda: is_supported)
-    arguments = ['--task', 'FetchReach', '--steps', '100', '--threads', '1', '--torch-threads', '1']
-    for setting in ('num_envs=2', 'updates_per_cycle=1', 'evaluation_episodes=2'):
-        arguments += ['--set', setting]
-    arguments += ['--set', 'device=cpu', '--set', 'precision=bfloat16']
-    assert main([*arguments, '--output', str(tmp_path)]) == 0
+    changes = {'num_envs': 2, 'total_steps': 100, 'device': 'cpu', 'precision': 'bfloat16'}
+    fields = options_of(**FIELDS | changes)
+    assert main(['--task', 'FetchReach', *fields, '--output', str(tmp_path)]) == 0
     assert ('use precision=float32' in capsys.readouterr().err) != is_supported
 
 

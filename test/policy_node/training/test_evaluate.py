@@ -220,18 +220,16 @@ def test_ctrl_c_reports_the_episodes_that_are_finished(capsys, monkeypatch):
     assert json.loads(capsys.readouterr().out)['episodes'] == 3
 
 
-@pytest.mark.parametrize(
-    ('content', 'message'),
-    [('[1]', 'contains no JSON object'), (None, 'cannot be written: ')],
-)
-def test_an_invalid_report_is_rejected_before_the_evaluation(tmp_path, content, message):
-    file = tmp_path / 'report.json'
-    if content is None:
-        file.mkdir()
-    else:
-        file.write_text(content)
-    module = 'policy_node.training.evaluate_reference'
-    command = [sys.executable, '-O', '-m', module, '--policy', 'FetchReach', '--json', str(file)]
-    found = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
-    assert found.returncode == 2 and message in found.stderr
-    assert found.stderr.count('\n') == 1 and not found.stdout
+def test_an_invalid_report_is_rejected_before_the_evaluation(tmp_path):
+    (tmp_path / 'list.json').write_text('[1]')
+    (tmp_path / 'folder.json').mkdir()
+    code = f"""
+from policy_node.training.evaluate_reference import main
+for name in ('list', 'folder'):
+    print(main(['--policy', 'FetchReach', '--json', f'{tmp_path}/{{name}}.json']))
+"""
+    command = [sys.executable, '-O', '-c', code]
+    found = subprocess.run(command, capture_output=True, text=True, check=True, timeout=120)
+    assert found.stdout == '2\n2\n'
+    listed, folder = found.stderr.splitlines()
+    assert 'contains no JSON object' in listed and 'cannot be written: ' in folder

@@ -12,11 +12,10 @@ from policy_node.policies.network_shape import NetworkShape
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.flat import from_flat, to_flat
 from policy_node.training.configuration.recipes import recipe_config
-from policy_node.training.experience.replay import Episodes, Starts, Transitions
+from policy_node.training.experience.replay import Episodes, Transitions
 from policy_node.training.learners.ddpg import DDPG
 from policy_node.training.machine import Workers
 from policy_node.training.research.frequent_actions import (
-    HoldingSampler,
     length_of,
     plain_actor,
     ticks_of,
@@ -184,33 +183,6 @@ def decisions(action: np.ndarray, most: int) -> list[int]:
         found.append(tick)
         tick += left[tick]
     return found
-
-
-def test_held_actions_are_learnt_from_with_as_many_steps() -> None:
-    """A walk to the right by one a tick; the goal is at 6: rewards and ends are known."""
-    ticks = 8
-    place = np.arange(ticks + 1, dtype=np.float32)
-    left = np.array([3, 2, 1, 4, 3, 2, 1, 1])
-    action = np.stack([np.ones(ticks, np.float32), length_of(left, 4)], axis=1)
-    episodes = Episodes(
-        observation=place[None, :, None],
-        achieved_goal=place[None, :, None],
-        desired_goal=np.full((1, 1), 6.0, np.float32),
-        action=action[None],
-    )
-    sampler = HoldingSampler(lambda a, g: -(a != g).any(axis=-1).astype(float), 0.5, most_steps=4)
-    row = np.zeros(200, np.int64)
-    batch = sampler.sample(episodes, row, {'real': 1.0}, np.random.default_rng(0))
-    tick = batch.observation[:, 0].astype(int)
-    steps = left[tick]
-    np.testing.assert_array_equal(batch.next_observation[:, 0], tick + steps)
-    np.testing.assert_allclose(batch.discount, 0.5**steps)
-    for index in range(200):
-        reached = [float(tick[index] + step + 1 != 6) for step in range(steps[index])]
-        expected = -sum(0.5**step * missed for step, missed in enumerate(reached))
-        assert batch.reward[index] == pytest.approx(expected)
-    starts = Starts(episodes, row[:1], np.array([5]), valid_ticks=np.array([6]))
-    assert sampler.steps(starts, starts.episodes.desired_goal, np.random.default_rng(0)) == [1]
 
 
 def test_an_actor_with_lengths_is_saved_as_one_that_decides_at_every_tick() -> None:

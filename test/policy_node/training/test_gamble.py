@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 import torch
 
 from policy_node.policies.network_shape import NetworkShape
 from policy_node.training.configuration.recipes import recipe_config
-from policy_node.training.experience.replay import Episodes, Transitions, has_moved
+from policy_node.training.experience.replay import Episodes, has_moved
 from policy_node.training.experience.sampling import TransitionSampler
-from policy_node.training.learners.ddpg import DDPG
 from policy_node.training.research.gamble import GambleSimulation, without_landings
 from support.learners import make_learner
 
@@ -96,30 +93,21 @@ def two_armed_gambles(count: int, generator: np.random.Generator) -> Episodes:
     return Episodes(observation, achieved, goal, action)
 
 
-def gambler(importance: str, mixture: dict[str, float]) -> tuple[DDPG, Callable[[], Transitions]]:
-    """A learner that knows nothing yet, and what draws its batches."""
+def learnt_values(importance: str) -> dict[str, float]:
+    """What a critic believes of both arms, for a goal that only gambling ever reaches."""
     generator = np.random.default_rng(0)
     learner = make_learner(NetworkShape(10, 3, 1, (64, 64)), gamma=0.0, importance=importance)
     episodes = two_armed_gambles(2_000, generator)
     sampler = TransitionSampler(
         lambda achieved, goal: -1.0 * (np.abs(achieved - goal).max(axis=-1) > 0.5), gamma=0.0
     )
-
-    def draw() -> Transitions:
-        row = generator.integers(len(episodes), size=256)
-        return sampler.sample(episodes, row, mixture, generator)
-
-    return learner, draw
-
-
-def learnt_values(importance: str, mixture: dict[str, float]) -> dict[str, float]:
-    """What a critic believes of both arms, for a goal that only gambling ever reaches."""
-    learner, draw = gambler(importance, mixture)
     for _ in range(500):
-        learner.update(draw())
-    goal = torch.tensor([[3.0, 0.0, 0.0]])
-    start = torch.tensor(draw().observation[:1])
-    features = learner.actor.features(start, goal)
+        row = generator.integers(len(episodes), size=256)
+        batch = sampler.sample(episodes, row, {'future': 0.5, 'real': 0.5}, generator)
+        learner.update(batch)
+    features = learner.actor.features(
+        torch.tensor(batch.observation[:1]), torch.tensor([[3.0, 0.0, 0.0]])
+    )
     with torch.no_grad():
         return {
             name: float(learner.critic(features, torch.tensor([[action]])))
@@ -127,58 +115,27 @@ def learnt_values(importance: str, mixture: dict[str, float]) -> dict[str, float
         }
 
 
-def test_future_goals_make_a_gamble_a_sure_thing() -> None:
-    """In truth it reaches a goal once in five times: its value is -0.8."""
-    assert learnt_values('none', {'future': 1.0})['gamble'] == pytest.approx(0.0, abs=0.1)
-
-
-@pytest.mark.release
-def test_goals_that_do_not_depend_on_the_landing_do_not() -> None:
-    assert learnt_values('none', {'real': 1.0})['gamble'] == pytest.approx(-0.8, abs=0.1)
-
-
 @pytest.mark.release
 def test_weights_take_back_what_hindsight_does() -> None:
-    mixture = {'future': 0.5, 'real': 0.5}
-    biased, weighted = (learnt_values(kind, mixture) for kind in ('none', 'density'))
+    """In truth a gamble reaches a goal once in five times: its value is -0.8."""
+    biased, weighted = (learnt_values(kind) for kind in ('none', 'density'))
     # Half of the gambles that go with this goal were chosen in hindsight: (0 - 0.8) / 2.
     assert biased['gamble'] == pytest.approx(-0.4, abs=0.15)
     assert weighted['gamble'] == pytest.approx(-0.8, abs=0.15)
     assert weighted['walk'] == pytest.approx(-1.0, abs=0.1)
 
 
-@pytest.mark.release
-def test_weighted_gambles_succeed_as_often_as_gambles_do() -> None:
-    """Once in five times; in a batch whose goals are half those achieved, three times."""
-    learner, draw = gambler('density', {'future': 0.5, 'real': 0.5})
-    for _ in range(500):
-        learner.importance(draw())
-    batches = [draw() for _ in range(20)]
-    weight = np.concatenate([learner.importance(batch) for batch in batches])
-    gamble = np.concatenate([batch.action[:, 0] > 0.0 for batch in batches])
-    lucky = gamble & np.concatenate([batch.reward == 0.0 for batch in batches])
-    assert lucky.sum() / gamble.sum() == pytest.approx(0.6, abs=0.03)
-    assert weight[lucky].sum() / weight[gamble].sum() == pytest.approx(0.2, abs=0.03)
-
-
 def test_a_landing_is_no_motion_of_the_robot() -> None:
     simulation = GambleSimulation('FetchPush', num_envs=2)
-    observations, achieved = [], []
-    for observation in (
-        simulation.reset(seed=3),
-        simulation.step([GAMBLE, WALK]).observation,
-        simulation.step([GAMBLE, WALK]).observation,
-    ):
-        observations.append(observation['observation'].copy())
-        achieved.append(observation['achieved_goal'].copy())
-    episodes = Episodes(
-        np.stack(observations, axis=1).astype(np.float32),
-        np.stack(achieved, axis=1).astype(np.float32),
-        simulation.goals.astype(np.float32),
-        np.zeros((2, 2, 4), np.float32),
+    seen = [simulation.reset(seed=3)]
+    seen += [simulation.step([GAMBLE, WALK]).observation for _ in range(2)]
+    observation, achieved = (
+        np.stack([each[name] for each in seen], axis=1).astype(np.float32)
+        for name in ('observation', 'achieved_goal')
     )
     # The second block is pushed before its robot gambles.
-    episodes.achieved_goal[1, 1:, 0] += 0.05
-    spec = simulation.spec
+    achieved[1, 1:, 0] += 0.05
+    goal, action = simulation.goals.astype(np.float32), np.zeros((2, 2, 4), np.float32)
+    episodes = Episodes(observation, achieved, goal, action)
     assert has_moved(episodes).tolist() == [1.0, 1.0]
-    assert has_moved(without_landings(episodes, spec)).tolist() == [0.0, 1.0]
+    assert has_moved(without_landings(episodes, simulation.spec)).tolist() == [0.0, 1.0]

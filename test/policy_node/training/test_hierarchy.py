@@ -12,7 +12,6 @@ import torch
 from fetch_hand_sim.simulation import Simulation
 from policy_node import load_policy
 from policy_node.policies.actor import Actor
-from policy_node.policies.files import read_tensors
 from policy_node.policies.network_shape import NORMALIZED_CLIP, NetworkShape
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.flat import from_flat
@@ -33,7 +32,7 @@ from policy_node.training.research.hierarchy import (
 )
 from policy_node.training.research.registry import make_collector
 from policy_node.training.runs.run_log import RunLog, read_progress
-from policy_node.training.runs.trainer import Trainer
+from support.runs import STATE, resumed, same, trainer_of, weights
 
 torch.set_num_threads(1)
 
@@ -159,27 +158,18 @@ def test_both_levels_learn_a_line_together() -> None:
         assert result.success.mean() > 0.9
 
 
-SMALL = {'num_envs': 8, 'updates_per_cycle': 4, 'batch_size': 64, 'evaluation_episodes': 8}
-SMALL |= {'simulation_threads': 1, 'torch_threads': 1, 'evaluate_every': 400}
-
-
 @pytest.mark.release
 def test_a_run_goes_on_where_it_stopped_and_saves_an_actor_like_any_other(tmp_path: Path) -> None:
-    config = recipe_config('FetchReach', 'best', subgoal_every=10, total_steps=1_200, **SMALL)
-    trainer = Trainer(config, tmp_path, Workers())
-    log = RunLog(tmp_path, config.total_steps, 0.0)
+    trainer = trainer_of(tmp_path, subgoal_every=10, total_steps=1_200)
+    log = RunLog(tmp_path, 1_200, 0.0)
     trainer.train(log)
     log.close()
     rows = read_progress(tmp_path / 'progress.csv')
     assert [row['eval_guided'] for row in rows if 'eval_success' in row]
     assert all(('eval_guided' in row) == ('eval_success' in row) for row in rows)
-    state = tmp_path / 'training_state.safetensors'
-    assert any(name.startswith('high_actor_optimizer.') for name in read_tensors(state)[0])
-    config = recipe_config('FetchReach', 'best', subgoal_every=10, total_steps=1_600, **SMALL)
-    again = Trainer(config, tmp_path, Workers())
-    again.resume(state)
-    for name, value in trainer.learner.modules()['high_critic'].state_dict().items():
-        assert torch.equal(value, again.learner.modules()['high_critic'].state_dict()[name])
+    assert any(name.startswith('high_actor_optimizer.') for name in weights(tmp_path / STATE))
+    again = resumed(tmp_path, subgoal_every=10, total_steps=1_600)
+    assert same(*(each.learner.modules()['high_critic'].state_dict() for each in (trainer, again)))
     assert again.train() == '1,600 environment steps done'
     assert again.learner.high.updates == again.learner.updates == 16
     loaded = load_policy(tmp_path / 'best.safetensors', 'FetchReach')

@@ -38,65 +38,41 @@ def relabelled(episodes, row, tick, mixture, generator):
     return goals_of(Starts(episodes, row, tick), source, list(mixture), generator)
 
 
-def draw(episodes, strategy, k=4):
+def draw(episodes, strategy):
     generator = np.random.default_rng(1)
-    row = generator.integers(COUNT, size=20_000)
-    tick = generator.integers(TICKS, size=20_000)
-    goal = relabelled(episodes, row, tick, goal_mixture(strategy, k), generator)
-    is_desired = goal[:, 0] >= 100
-    return row, tick, goal, is_desired
+    row, tick = (generator.integers(limit, size=20_000) for limit in (COUNT, TICKS))
+    return row, tick, relabelled(episodes, row, tick, goal_mixture(strategy, 4), generator)
 
 
 def test_none_keeps_every_goal(episodes):
-    row, _, goal, _ = draw(episodes, 'none')
+    row, _, goal = draw(episodes, 'none')
     assert (goal == episodes.desired_goal[row]).all()
 
 
-@pytest.mark.parametrize('strategy', ['future', 'final', 'episode', 'random'])
-def test_the_share_of_relabelled_goals_is_k_of_k_plus_1(episodes, strategy):
-    row, _, goal, is_desired = draw(episodes, strategy, k=4)
-    assert is_desired.mean() == pytest.approx(0.2, abs=0.01)
-    assert (goal[is_desired] == episodes.desired_goal[row[is_desired]]).all()
-
-
-def test_future_goals_come_later_in_the_same_episode(episodes):
-    row, tick, goal, is_desired = draw(episodes, 'future')
-    row, tick, goal = row[~is_desired], tick[~is_desired], goal[~is_desired]
-    assert (goal[:, 0] == row).all()
-    assert (goal[:, 1] > tick).all()
+@pytest.mark.parametrize(
+    ('strategy', 'kept', 'own_desired', 'own_achieved'),
+    [
+        ('future', 0.2, 1.0, 1.0),
+        ('final', 0.2, 1.0, 1.0),
+        ('episode', 0.2, 1.0, 1.0),
+        ('random', 0.2, 1.0, 1 / COUNT),
+        ('futureactual', 0.6, 1 / 3 + 2 / 3 / COUNT, 1.0),
+    ],
+)
+def test_goals_are_from_the_episode_and_the_ticks_of_their_strategy(
+    episodes, strategy, kept, own_desired, own_achieved
+):
+    """A share of goals is kept; of these, and of those achieved, a share is of the same episode."""
+    row, tick, goal = draw(episodes, strategy)
+    desired, achieved = goal[:, 0] >= 100, goal[:, 0] < 100
+    assert desired.mean() == pytest.approx(kept, abs=0.015)
+    assert (goal[desired, 0] == 100 + row[desired]).mean() == pytest.approx(own_desired, abs=0.02)
+    assert (goal[achieved, 0] == row[achieved]).mean() == pytest.approx(own_achieved, abs=0.02)
     for start in range(TICKS):
-        seen = goal[tick == start, 1]
-        assert set(seen.tolist()) == set(range(start + 1, TICKS + 1))
-        assert seen.mean() == pytest.approx((start + 1 + TICKS) / 2, abs=0.25)
-
-
-def test_final_goals_are_the_last_of_the_same_episode(episodes):
-    row, _, goal, is_desired = draw(episodes, 'final')
-    assert (goal[~is_desired, 0] == row[~is_desired]).all()
-    assert (goal[~is_desired, 1] == TICKS).all()
-
-
-def test_episode_goals_are_any_of_the_same_episode(episodes):
-    row, tick, goal, is_desired = draw(episodes, 'episode')
-    assert (goal[~is_desired, 0] == row[~is_desired]).all()
-    assert set(goal[~is_desired, 1].tolist()) == set(range(1, TICKS + 1))
-    assert (goal[~is_desired, 1] <= tick[~is_desired]).any()
-
-
-def test_random_goals_are_achieved_anywhere_in_the_replay(episodes):
-    row, _, goal, is_desired = draw(episodes, 'random')
-    same = (goal[~is_desired, 0] == row[~is_desired]).mean()
-    assert same == pytest.approx(1 / COUNT, abs=0.02)
-    assert set(goal[~is_desired, 1].tolist()) == set(range(1, TICKS + 1))
-
-
-def test_futureactual_mixes_future_with_desired_goals_of_any_episode(episodes):
-    row, tick, goal, is_desired = draw(episodes, 'futureactual')
-    assert is_desired.mean() == pytest.approx(0.6, abs=0.015)
-    assert (goal[~is_desired, 0] == row[~is_desired]).all()
-    assert (goal[~is_desired, 1] > tick[~is_desired]).all()
-    own = (goal[is_desired, 0] == 100 + row[is_desired]).mean()
-    assert own == pytest.approx(1 / 3 + 2 / 3 / COUNT, abs=0.02)
+        first = {'final': TICKS, 'episode': 1, 'random': 1}.get(strategy, start + 1)
+        state = goal[achieved & (tick == start), 1]
+        assert set(state.tolist()) == set(range(first, TICKS + 1))
+        assert state.mean() == pytest.approx((first + TICKS) / 2, abs=0.35)
 
 
 def test_displaced_goals_are_near_the_state_and_know_nothing_of_the_step(episodes):
@@ -177,26 +153,17 @@ def test_a_bad_mixture_is_refused(text, message):
         recipe_config('FetchReach', 'best', goals=text)
 
 
-def numbered(count, ticks):
-    """Achieved goals are (episode, state)."""
-    row, state = np.meshgrid(np.arange(count), np.arange(ticks + 1), indexing='ij')
-    achieved = np.stack([row, state], axis=-1).astype(np.float32)
-    return Episodes(achieved, achieved, np.full((count, 2), -1, np.float32), achieved[:, :ticks])
-
-
 @pytest.mark.parametrize('source', ['future', 'final', 'episode', 'random'])
-def test_nothing_is_drawn_from_after_the_last_valid_tick(source):
-    """Neither transitions nor goals: episode 0 is worth 5 ticks, 1 is worth 20, 2 all 40."""
-    episodes, valid = numbered(3, 40), np.array([5, 20, 40])
+def test_nothing_is_drawn_from_after_the_last_valid_tick(episodes, source):
+    """Neither transitions nor goals."""
+    valid = np.array([1, 2, 5, 7, TICKS, TICKS])
     generator = np.random.default_rng(2)
-    row = generator.integers(3, size=20_000)
+    row = generator.integers(COUNT, size=20_000)
     reward = lambda achieved, desired: np.zeros(len(achieved))  # noqa: E731
     batch = TransitionSampler(reward, 0.9).sample(episodes, row, {source: 1.0}, generator, valid)
-    for values, least in ((batch.observation, 0), (batch.goal, 1)):
-        episode, state = values[:, 0].astype(int), values[:, 1]
-        assert (state < valid[episode] + least).all()
-        if values is batch.observation:
-            assert all(set(state[episode == e]) == set(range(valid[e])) for e in range(3))
+    tick = batch.observation[:, 1]
+    assert all(set(tick[row == each]) == set(range(valid[each])) for each in range(COUNT))
+    assert (batch.goal[:, 1] <= valid[batch.goal[:, 0].astype(int)]).all()
     if source == 'final':
         assert (batch.goal[:, 1] == valid[row]).all()
 

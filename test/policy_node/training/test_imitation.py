@@ -21,11 +21,15 @@ torch.set_num_threads(1)
 LATE = '{"action": {"latency": 1}}'
 
 
+def trainer_of(config, folder):
+    networks = read_initial_networks(config.task).fitted(config)
+    return ImitationTrainer(config, folder, Workers(), '', '', networks)
+
+
 def test_each_input_is_answered_in_the_state_in_which_the_action_arrives(tmp_path):
     task = 'FetchPush'
     config = recipe_config(task, 'robust', num_envs=2, disturbances=LATE)
-    networks = read_initial_networks(task).fitted(config)
-    trainer = ImitationTrainer(config, tmp_path, Workers(), '', '', networks)
+    trainer = trainer_of(config, tmp_path)
     trainer._collect()
     pairs = 2 * (TASKS[task].episode_ticks - 1)
     inputs, answers = (part[:pairs] for part in trainer._answers._parts)
@@ -42,8 +46,7 @@ def test_successive_cycles_scale_the_disturbances(tmp_path):
     config = recipe_config(
         'FetchPush', 'robust', num_envs=2, disturbances=LATE, disturbance_scales=(0.0, 1.0)
     )
-    networks = read_initial_networks('FetchPush').fitted(config)
-    trainer = ImitationTrainer(config, tmp_path, Workers(), '', '', networks)
+    trainer = trainer_of(config, tmp_path)
     for stored in (2 * 50, 2 * 50 + 2 * 49):
         trainer._collect()
         assert trainer._answers._count == stored
@@ -52,8 +55,7 @@ def test_successive_cycles_scale_the_disturbances(tmp_path):
 def test_the_critic_of_the_imitated_policy_judges_the_actions(tmp_path):
     task = 'FetchSlide'
     config = recipe_config(task, 'robust', num_envs=2, value_weight=1.0, updates_per_cycle=5)
-    networks = read_initial_networks(task).fitted(config)
-    trainer = ImitationTrainer(config, tmp_path, Workers(), '', '', networks)
+    trainer = trainer_of(config, tmp_path)
     trainer._collect()
     _, answers, states = trainer._answers.draw(64)
     # The imitated policy was trained to maximise the values of this critic.

@@ -127,13 +127,9 @@ def test_a_condition_starts_without_effect_and_is_fixed_for_other_runs(
     torch.testing.assert_close(said(follower), said(run, acting))
 
 
-@pytest.mark.release
 def test_a_second_critic_starts_from_random_weights(tmp_path, block_run):
-    task, run = BLOCK, tmp_path / 'two'
-    twins = ['--set=critics=2', '--set=aggregate=min', *SET]
-    arguments = ['--task', task, '--steps', '200', *twins, '--init-from', str(block_run)]
     one = read_initial_networks(str(block_run))
-    config = tiny(task, critics=2, aggregate='min')
+    config = tiny(BLOCK, critics=2, aggregate='min')
     networks = one.fitted(config)
     assert (one.critics, networks.critics) == (1, 1)
     started = start(tmp_path, config, networks)
@@ -143,29 +139,14 @@ def test_a_second_critic_starts_from_random_weights(tmp_path, block_run):
     for part in (first, started.learner.target_critic.members[0]):
         assert not same(part.state_dict(), second.state_dict())
     assert same(started.learner.target_critic.members[1].state_dict(), second.state_dict())
-    assert main([*arguments, '--output', str(run)]) == 0
-    two = read_initial_networks(str(run))
+    started.save()
+    two = read_initial_networks(str(tmp_path))
     assert two.critics == 2
     again = start(tmp_path, config, two.fitted(config)).learner
     assert again.critic_first == 0
     assert same(again.critic.state_dict(), part_of(two.tensors, 'critic'))
-    alone = Trainer(tiny(task), tmp_path, Workers(), init_from=two.fitted(tiny(task))).learner
+    alone = start(tmp_path, tiny(BLOCK), two.fitted(tiny(BLOCK))).learner
     assert same(alone.critic.state_dict(), part_of(two.tensors, 'critic.members.0'))
-
-
-@pytest.mark.release
-def test_a_critic_with_another_norm_starts_from_random_weights(tmp_path, block_run):
-    task, run = BLOCK, tmp_path / 'run'
-    config = tiny(task, norm='layer')
-    networks = read_initial_networks(str(block_run)).fitted(config)
-    assert not networks.critics
-    started = start(tmp_path, config, networks).learner
-    assert started.critic_first == CRITIC_FIRST
-    assert same(started.actor.state_dict(), part_of(networks.tensors, 'actor'))
-    arguments = ['--task', task, '--steps', '200', *SET, '--set=norm=layer']
-    assert main([*arguments, '--init-from', str(block_run), '--output', str(run)]) == 0
-    on = read_initial_networks(str(run))
-    assert on.fitted(config).critics and not on.fitted(tiny(task)).critics
 
 
 def test_without_targets_a_run_starts_from_the_networks_themselves(tmp_path, block_run):
@@ -323,8 +304,10 @@ def test_finetune_needs_an_object_in_the_hand():
         recipe_config('HandReach', 'finetune')
 
 
-@pytest.mark.parametrize('changes', [{'reward_type': 'dense'}, {'control_hz': 250.0}])
-def test_a_critic_of_other_rewards_is_left_out(changes, tmp_path, block_run):
+@pytest.mark.parametrize(
+    'changes', [{'reward_type': 'dense'}, {'control_hz': 250.0}, {'norm': 'layer'}]
+)
+def test_a_critic_of_other_rewards_or_norm_starts_from_random_weights(changes, tmp_path, block_run):
     task = BLOCK
     networks = read_initial_networks(str(block_run))
     assert networks.fitted(tiny(task)).critics
@@ -334,6 +317,9 @@ def test_a_critic_of_other_rewards_is_left_out(changes, tmp_path, block_run):
     started = start(tmp_path, config, fitted)
     assert started.learner.critic_first == CRITIC_FIRST
     assert same(started.learner.actor.state_dict(), part_of(networks.tensors, 'actor'))
+    started.save()
+    own = read_initial_networks(str(tmp_path))
+    assert own.fitted(config).critics and not own.fitted(tiny(task)).critics
 
 
 def test_each_run_behind_an_actor_counts_once_with_its_latest_actor():

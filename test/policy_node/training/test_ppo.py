@@ -28,17 +28,21 @@ from policy_node.training.research.rollouts import (
     decision_weights,
     goals_in_hindsight,
 )
-from policy_node.training.runs.trainer import Trainer
+from support.runs import resumed, trained
 
 torch.set_num_threads(1)
 
 ON_POLICY = {'algorithm': 'ppo', 'overlap': False, 'random_epsilon': 0.0, 'noise_std': 0.3}
-SMALL = {'num_envs': 8, 'updates_per_cycle': 4, 'batch_size': 64, 'evaluation_episodes': 8}
-SMALL |= {'simulation_threads': 1, 'torch_threads': 1, 'evaluate_every': 400}
 
 
 def configured(**changes: object) -> TrainConfig:
     return recipe_config('FetchReach', 'best', **{**ON_POLICY, **changes})
+
+
+def make_ppo(config: TrainConfig, *sizes: int, hidden: tuple[int, ...] = (32, 32)) -> PPO:
+    """A learner for observations, goals and actions of these sizes."""
+    torch.manual_seed(0)
+    return PPO(NetworkShape(*sizes, hidden), config, torch.device('cpu'), Workers())
 
 
 def test_densities_of_several_parts_multiply_and_have_gradients_beyond_the_limits() -> None:
@@ -154,10 +158,9 @@ def improve(learner: PPO, rollouts: RolloutTransitions, generator: np.random.Gen
 
 def learn(cycles: int, **changes: object) -> tuple[PPO, RolloutMaker]:
     """One step, whose action is what is achieved; goals lie anywhere from -.8 to .8."""
-    torch.manual_seed(0)
     generator = np.random.default_rng(0)
     config = configured(learning_rate=3e-3, action_l2=0.0, gamma=0.5, **changes)
-    learner = PPO(NetworkShape(1, 1, 1, (32, 32)), config, torch.device('cpu'), Workers())
+    learner = make_ppo(config, 1, 1, 1)
     corrects = config.importance == 'decision'
     maker = RolloutMaker(learner, reached, config.gamma, 0.95, corrects)
     for _ in range(cycles):
@@ -192,10 +195,9 @@ def pushed(action: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize(('source', 'pushes'), [('final', False), ('outcome', True)])
 def test_outcomes_of_others_teach_to_push_and_own_ones_do_not(source: str, pushes: bool) -> None:
     """No goal that is asked for can be met; what 1 in 20 episodes does by accident is learnt."""
-    torch.manual_seed(0)
     generator = np.random.default_rng(0)
     config = configured(learning_rate=3e-3, action_l2=0.0, gamma=0.5, first_value=-2.0)
-    learner = PPO(NetworkShape(1, 3, 1, (32, 32)), config, torch.device('cpu'), Workers())
+    learner = make_ppo(config, 1, 3, 1)
     metric = GoalMetric(task_spec('FetchPush'))
     maker = RolloutMaker(learner, metric.reward, config.gamma, 0.95, False)
     goal = np.full((256, 3), -0.3)
@@ -213,9 +215,7 @@ def test_outcomes_of_others_teach_to_push_and_own_ones_do_not(source: str, pushe
 def test_gain_makes_the_first_actions_small_and_leaves_their_direction() -> None:
     actions = []
     for gain in (1.0, 0.01):
-        torch.manual_seed(0)
-        config = configured(first_action_gain=gain)
-        learner = PPO(NetworkShape(1, 1, 4, (32, 32)), config, torch.device('cpu'), Workers())
+        learner = make_ppo(configured(first_action_gain=gain), 1, 1, 4)
         asked = {'observation': np.ones((1, 1)), 'desired_goal': np.ones((1, 1))}
         actions.append(learner.evaluation_actor().predict(asked)[0])
     assert np.abs(actions[0]).max() > 0.1
@@ -298,9 +298,8 @@ def test_a_share_of_a_batch_is_from_episodes_that_moved_the_object(share: float)
 
 def test_the_first_losses_are_those_of_the_definition() -> None:
     """Two actions each, within the range and at its limits; weights, and ratios either way."""
-    torch.manual_seed(0)
     config = configured(action_l2=0.7, learning_rate=0.0)
-    learner = PPO(NetworkShape(1, 1, 2, (4,)), config, torch.device('cpu'), Workers())
+    learner = make_ppo(config, 1, 1, 2, hidden=(4,))
     ratio = np.array([0.5, 0.5, 0.9, 1.1, 2.0, 2.0])
     advantage = np.array([1.0, -1.0, 3.0, -2.0, 4.0, -5.0])
     # What is good gains no more beyond 1.2, what is bad loses no less below 0.8.
@@ -348,8 +347,7 @@ def test_probabilities_that_float32_cannot_compare_ruin_no_network(
     log_ratio: float, advantage: float
 ) -> None:
     """As of goals in hindsight beside little noise: exp(89) is beyond float32."""
-    torch.manual_seed(0)
-    learner = PPO(NetworkShape(1, 1, 2, (4,)), configured(), torch.device('cpu'), Workers())
+    learner = make_ppo(configured(), 1, 1, 2, hidden=(4,))
     pairs = {name: np.full((6, 1), 0.3, np.float32) for name in ('observation', 'goal')}
     action, numbers = np.full((6, 2), 0.2, np.float32), np.zeros(6, np.float32)
     logs = learner.log_probabilities(pairs['observation'], pairs['goal'], action)
@@ -381,11 +379,8 @@ def test_probabilities_that_float32_cannot_compare_ruin_no_network(
     ids=['taken', 'weighed', 'outcomes'],
 )
 def test_a_run_of_ppo_goes_on_where_it_stopped(changes: dict[str, object], tmp_path: Path) -> None:
-    config = configured(**changes, total_steps=800, **SMALL)
-    Trainer(config, tmp_path, Workers()).train()
-    config = configured(**changes, total_steps=1_600, **SMALL)
-    trainer = Trainer(config, tmp_path, Workers())
-    trainer.resume(tmp_path / 'training_state.safetensors')
+    trained(tmp_path, total_steps=800, **ON_POLICY, **changes)
+    trainer = resumed(tmp_path, total_steps=1_600, **ON_POLICY, **changes)
     assert trainer.counters.updates == 2 * 4
     assert trainer.train() == '1,600 environment steps done'
     assert trainer.counters.updates == 4 * 4 and (tmp_path / 'best.safetensors').is_file()

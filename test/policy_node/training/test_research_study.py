@@ -357,22 +357,3 @@ def test_a_full_disk_leaves_stored_runs_and_page_as_they_were(
     with files_at_most(largest), pytest.raises(OSError, match='large'):
         write_study(STUDIES['returns'], tmp_path)
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
-
-
-@pytest.mark.parametrize(
-    ('arguments', 'message'),
-    [
-        (['--arms', 'ddpg'], "--arms 'ddpg'; allowed in unbiased: future, "),
-        (
-            ['--tasks', 'FetchSlide'],
-            '--tasks FetchSlide; allowed in unbiased: FetchReach, FetchPush',
-        ),
-        (['--set', 'goals=final=1'], '--set goals is not possible: jobs differ in it'),
-    ],
-)
-def test_bad_usage_is_one_line_and_exit_status_2(
-    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    assert main(['--study', 'unbiased', *arguments, '--output', str(tmp_path / 'runs')]) == 2
-    error = capsys.readouterr().err
-    assert message in error and error.count('\n') == 1

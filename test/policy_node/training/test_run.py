@@ -16,7 +16,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 
 from fetch_hand_sim.datasets.writing import alone_in
 from policy_node.policies import checkpoint
@@ -28,7 +27,17 @@ from policy_node.training.runs.run import lock_run
 from policy_node.training.runs.run_log import read_progress
 from policy_node.training.train_her import main
 from support.full_disk import files_at_most
-from support.runs import SMALL, STATE, one_line, options_of, resumed, trained, trainer_of, weights
+from support.runs import (
+    SMALL,
+    STATE,
+    one_line,
+    options_of,
+    resumed,
+    same,
+    trained,
+    trainer_of,
+    weights,
+)
 
 SET = options_of(**SMALL | {'evaluate_every': 1_000})
 REACH = ['--task', 'FetchReach', *SET]
@@ -152,19 +161,21 @@ def test_a_run_that_its_limits_ended_is_not_trained_any_further(tmp_path, limit,
     assert again.counters.env_steps == 0
 
 
-def test_the_actor_that_a_run_ends_with_is_evaluated(tmp_path):
-    trainer = trainer_of(tmp_path, total_steps=1_200, evaluate_every=100_000)
-    log = StopAfter(trainer)
-    trainer.train(log)
-    evaluated = [row['env_steps'] for row in log.rows if row.get('eval_success') is not None]
-    assert evaluated == [800, 1_200], 'after the first updates, and at the end'
-    assert trainer.counters.best_success == max(row.get('eval_success') or 0 for row in log.rows)
-
-
-@pytest.mark.parametrize('overlap', [True, pytest.param(False, marks=pytest.mark.release)])
-def test_the_last_evaluation_is_of_the_last_actor(tmp_path, monkeypatch, overlap):
+@pytest.mark.parametrize(
+    ('overlap', 'evaluate_every', 'at'),
+    [
+        (True, 400, [800, 1_200]),
+        # After the first updates, and at the end.
+        (True, 100_000, [800, 1_200]),
+        pytest.param(False, 400, [400, 800, 1_200], marks=pytest.mark.release),
+    ],
+)
+def test_the_last_evaluation_is_of_the_last_actor(
+    tmp_path, monkeypatch, overlap, evaluate_every, at
+):
     """With `overlap`, an evaluation due in the last cycle would run beside the learner."""
-    trainer = trainer_of(tmp_path, total_steps=1_200, overlap=overlap)
+    fields = {'overlap': overlap, 'evaluate_every': evaluate_every}
+    trainer = trainer_of(tmp_path, total_steps=1_200, **fields)
     evaluated = []
 
     def evaluate(simulation, actor, *options):
@@ -174,9 +185,10 @@ def test_the_last_evaluation_is_of_the_last_actor(tmp_path, monkeypatch, overlap
     monkeypatch.setattr('policy_node.training.runs.trainer.evaluate', evaluate)
     log = StopAfter(trainer)
     trainer.train(log)
-    last, now = evaluated[-1].state_dict(), trainer.learner.evaluation_actor().state_dict()
-    assert all(torch.equal(value, now[name]) for name, value in last.items())
-    assert len(evaluated) == sum('eval_success' in row for row in log.rows) == 3 - overlap
+    assert same(evaluated[-1].state_dict(), trainer.learner.evaluation_actor().state_dict())
+    rows = [row for row in log.rows if row.get('eval_success') is not None]
+    assert [row['env_steps'] for row in rows] == at and len(evaluated) == len(at)
+    assert trainer.counters.best_success == max(row['eval_success'] for row in rows)
 
 
 def test_a_run_that_goes_on_is_evaluated_as_often_as_it_now_should(tmp_path):

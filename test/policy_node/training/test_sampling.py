@@ -11,7 +11,7 @@ from msgs_spec.tasks import task_spec
 from policy_node.policies.actor import Actor
 from policy_node.policies.network_shape import NetworkShape
 from policy_node.training.configuration.recipes import recipe_config
-from policy_node.training.experience.replay import Episodes, Starts
+from policy_node.training.experience.replay import Episodes
 from policy_node.training.experience.sampling import TransitionSampler
 from policy_node.training.machine import Workers
 from policy_node.training.research.conditions import HorizonSampler, fold
@@ -52,20 +52,6 @@ class Judge:
 
     def act(self, observation, goal):
         return np.where(observation < 3.0, 1.0, -1.0).astype(np.float32)
-
-
-def test_several_steps_of_one_are_one_step(walk):
-    sampler = TransitionSampler(at_goal, 0.9)
-    starts = Starts(walk, np.repeat(np.arange(20), TICKS), np.tile(np.arange(TICKS), 20))
-    goal = walk.desired_goal[starts.row]
-    plain = sampler.single(starts, goal)
-
-    def reward(achieved, chosen):
-        return at_goal(achieved, goal[chosen])
-
-    counted = sampler.several(starts, np.ones_like(starts.row), goal, reward)
-    for name in ('observation', 'next_observation', 'action', 'reward', 'discount', 'goal'):
-        np.testing.assert_array_equal(getattr(plain, name), getattr(counted, name))
 
 
 def test_lambda_draws_the_weights_of_the_lambda_return(walk):

@@ -169,14 +169,22 @@ def test_a_folder_that_holds_a_run_is_left_alone(tmp_path):
     assert (tmp_path / 'training_state.safetensors').read_bytes() == before
 
 
-def test_ctrl_c_saves_the_run_and_ends_the_program_around_it(tmp_path):
+def test_ctrl_c_saves_the_run_and_ends_the_program_and_a_second_one_raises_at_once(tmp_path):
     code = f"""
 import os, signal
 from policy_node.training import train
 
-for seed in range(2):
-    train('FetchReach', {str(tmp_path)!r} + f'/{{seed}}', total_steps=100_000, seed=seed,
-          on_cycle=lambda row: os.kill(os.getpid(), signal.SIGINT), **{SMALL!r})
+def run(name, interrupts):
+    train('FetchReach', {str(tmp_path)!r} + '/' + name, total_steps=100_000, **{SMALL!r},
+          on_cycle=lambda row: [os.kill(os.getpid(), signal.SIGINT) for _ in range(interrupts)])
+
+try:
+    run('twice', 2)
+except KeyboardInterrupt as error:
+    print('alive', error.args)
+print(signal.getsignal(signal.SIGINT) is signal.default_int_handler)
+run('once', 1)
+run('never', 1)
 """
     result = subprocess.run(
         [sys.executable, '-c', code],
@@ -185,33 +193,12 @@ for seed in range(2):
         text=True,
         timeout=120,
     )
-    assert result.returncode == -signal.SIGINT, result.stderr
-    assert result.stderr.rstrip().endswith('KeyboardInterrupt: stopped by SIGINT')
-    assert sorted(os.listdir(tmp_path)) == ['0']
-    resumed = train('FetchReach', Path(tmp_path / '0'), resume=True, total_steps=800, quiet=True)
-    assert resumed.env_steps == 800
-
-
-def test_a_second_ctrl_c_raises_at_once_and_leaves_the_program_alive(tmp_path):
-    code = f"""
-import os, signal
-from policy_node.training import train
-
-def twice(row):
-    os.kill(os.getpid(), signal.SIGINT)
-    os.kill(os.getpid(), signal.SIGINT)
-
-try:
-    train('FetchReach', {str(tmp_path / 'run')!r}, total_steps=100_000, on_cycle=twice, **{SMALL!r})
-except KeyboardInterrupt as error:
-    print('alive', error.args)
-print(signal.getsignal(signal.SIGINT) is signal.default_int_handler)
-"""
-    command = [sys.executable, '-c', code]
-    result = subprocess.run(
-        command, env=script_environment(), capture_output=True, text=True, timeout=120
-    )
     assert result.stdout.splitlines() == ['alive ()', 'True'], result.stderr
+    assert result.returncode == -signal.SIGINT
+    assert result.stderr.rstrip().endswith('KeyboardInterrupt: stopped by SIGINT')
+    assert sorted(os.listdir(tmp_path)) == ['once', 'twice']
+    resumed = train('FetchReach', tmp_path / 'once', resume=True, total_steps=800, quiet=True)
+    assert resumed.env_steps == 800
 
 
 def test_a_missing_extra_is_named(tmp_path):

@@ -121,21 +121,15 @@ def logged(tmp_path_factory):
 
 
 def test_logged_episodes_are_learnt_from_before_any_step(tmp_path, logged, capsys):
-    for name, extra in (('with', ['--from-episodes', str(logged)]), ('without', [])):
-        waits = ['--set', 'learning_starts=1000', '--output', str(tmp_path / name)]
-        assert main([*RUN, *waits, *extra]) == 0
+    run, waits = tmp_path / 'run', ['--set', 'learning_starts=1400']
+    assert main([*RUN, *waits, '--output', str(run), '--from-episodes', str(logged)]) == 0
     said = capsys.readouterr().err
     assert f'12 episodes from {logged}; 1 left out, first: ' in said
     assert 'FetchPush, not FetchReach' in said
-    with_logs, without = (
-        read_progress(tmp_path / name / 'progress.csv') for name in ('with', 'without')
-    )
-    # 600 transitions of the logs and 400 of the first cycle make the 1,000.
-    assert [row['updates'] for row in with_logs] == [4, 8, 12]
-    assert [row['updates'] for row in without] == [0, 0, 4]
-    assert [row['env_steps'] for row in with_logs] == [400, 800, 1200]
-    state = weights(tmp_path / 'with' / STATE)
-    assert state['observation_statistics.count'] == 1200 + 600
+    # 600 transitions of the logs and 800 of the first two cycles make the 1,400.
+    rows = read_progress(run / 'progress.csv')
+    assert [(row['env_steps'], row['updates']) for row in rows] == [(400, 0), (800, 4), (1200, 8)]
+    assert weights(run / STATE)['observation_statistics.count'] == 1200 + 600
 
 
 def test_workers_share_logged_episodes_and_a_resumed_run_counts_them_once(tmp_path, logged):
@@ -185,32 +179,29 @@ def test_graded_rewards_are_shares_of_thresholds_met():
     np.testing.assert_array_equal(sparse(achieved, goal), metric.reward(achieved, goal))
 
 
-def test_training_may_grade_its_rewards(tmp_path):
-    """FetchReach succeeds within 0.05 m; within 0.1 m, half of the grades 1 and 2 are met."""
-    trainer = trainer_of(tmp_path, reward_grades='1,2', batch_size=512)
-    trainer.experience.replay.add(trainer.collector.collect(trainer.learner.actor)[0])
-    batch = trainer.experience.batch(env_steps=0)
-    assert set(batch.reward.tolist()) == {-1.0, -0.5, 0.0}
-    position = batch.next_observation[:, :3].astype(np.float64)
-    distance = np.linalg.norm(position - batch.goal, axis=-1)
-    clear = np.abs(distance - 0.05) > 1e-4
-    np.testing.assert_array_equal(batch.reward[clear] == 0.0, distance[clear] < 0.05)
-    assert trainer.simulation.metric.reward_type == 'sparse'
-
-
-def test_thresholds_of_training_narrow_from_the_first_to_those_of_the_task(tmp_path):
-    """FetchReach's 0.05 m are 0.2 m at the start, 0.1 m after a third of the run, then 0.05 m."""
-    narrowing = {'first_distance': 4.0, 'total_steps': 3_000, 'goals': 'random=1'}
-    trainer = trainer_of(tmp_path, batch_size=512, **narrowing)
+@pytest.mark.parametrize(
+    ('changes', 'thresholds'),
+    [
+        # FetchReach's 0.05 m are 0.2 m at the start, 0.1 m after a third of the run, then 0.05 m.
+        ({'first_distance': 4.0}, ([0.2], [0.1], [0.05], [0.05])),
+        # Half of the grades are met within 0.1 m.
+        ({'reward_grades': '1,2'}, ([0.1, 0.05],)),
+    ],
+)
+def test_thresholds_of_training_narrow_and_may_be_several(tmp_path, changes, thresholds):
+    fields = {'total_steps': 3_000, 'goals': 'random=1', 'batch_size': 512, **changes}
+    trainer = trainer_of(tmp_path, **fields)
     trainer.experience.replay.add(trainer.collector.collect(RandomPolicy(4))[0])
-    for env_steps, threshold in ((0, 0.2), (1_000, 0.1), (2_000, 0.05), (3_000, 0.05)):
+    for env_steps, limits in zip(range(0, 4_000, 1_000), thresholds, strict=False):
         trainer.experience.narrow(env_steps / 3_000)
         batch = trainer.experience.batch(env_steps)
         position = batch.next_observation[:, :3].astype(np.float64)
         distance = np.linalg.norm(position - batch.goal, axis=-1)
-        clear = np.abs(distance - threshold) > 1e-4
-        np.testing.assert_array_equal(batch.reward[clear] == 0.0, distance[clear] < threshold)
-        assert ((distance > 0.5 * threshold) & (distance < threshold)).any()
+        met = np.mean([distance < limit for limit in limits], axis=0)
+        clear = np.min([np.abs(distance - limit) for limit in limits], axis=0) > 1e-4
+        np.testing.assert_array_equal(batch.reward[clear], met[clear] - 1.0)
+        assert ((distance > 0.5 * limits[0]) & (distance < limits[0])).any()
+    assert trainer.simulation.metric.reward_type == 'sparse'
 
 
 def test_settings_of_training_do_not_change_evaluation(tmp_path):
@@ -379,6 +370,13 @@ def test_bad_usage_is_one_line_and_exit_status_2(arguments, message, capsys, tmp
     assert message in one_line(capsys)
 
 
+@pytest.fixture(scope='module')
+def saved_run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp('saved')
+    trainer_of(folder, strategy='none', hidden_sizes=(8, 8)).save()
+    return folder
+
+
 @pytest.mark.parametrize(
     ('arguments', 'message'),
     [
@@ -392,7 +390,7 @@ def test_bad_usage_is_one_line_and_exit_status_2(arguments, message, capsys, tmp
         (['--condition', 'horizon'], "condition 'none', which cannot change to 'horizon'"),
         (['--subgoal-every', '5'], 'subgoal_every 0, which cannot change to 5'),
         (['--longest-hold', '20'], 'longest_hold 1, which cannot change to 20'),
-        (['--hidden-sizes', '8,8'], 'hidden_sizes (256, 256, 256), which cannot change to (8, 8)'),
+        (['--hidden-sizes', '9,9'], 'hidden_sizes (8, 8), which cannot change to (9, 9)'),
         (['--seed', '9'], 'seed 0, which cannot change to 9'),
         (['--critics', '2'], 'critics 1, which cannot change to 2'),
         (['--goal-features', 'relative'], "goal_features 'plain', which cannot change"),
@@ -401,8 +399,7 @@ def test_bad_usage_is_one_line_and_exit_status_2(arguments, message, capsys, tmp
     ],
 )
 def test_a_resumed_run_rejects_changed_networks_and_experience(
-    arguments, message, capsys, tmp_path
+    saved_run, arguments, message, capsys
 ):
-    trainer_of(tmp_path, strategy='none').save()
-    assert main(['--resume', str(tmp_path), *arguments]) == 2
+    assert main(['--resume', str(saved_run), *arguments]) == 2
     assert message in one_line(capsys)
