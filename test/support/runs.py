@@ -21,6 +21,7 @@ SMALL: dict[str, Any] = {
     'num_envs': 8,
     'updates_per_cycle': 4,
     'batch_size': 64,
+    'hidden_sizes': (16, 16),
     'evaluation_episodes': 8,
     'evaluate_every': 400,
     'simulation_threads': 1,

@@ -59,11 +59,8 @@ def test_every_task_is_trained_with_its_best_recipe_after_what_it_starts_from(
         if start:
             assert job.config.init_from == folder and job.config.learning_starts > 0
             assert job.after in jobs[:number] and job.after.config.task == start.task
-
-
-def test_a_task_alone_starts_from_nothing(tmp_path: Path) -> None:
-    (job,) = jobs_of('--tasks', 'HandManipulateEggFull', '--output', str(tmp_path))
-    assert job.after is None and job.config.init_from == ''
+    (alone,) = jobs_of('--tasks', EGGS[1], '--output', str(tmp_path))
+    assert alone.after is None and alone.config.init_from == ''
 
 
 def test_the_status_of_a_job_says_how_far_it_is_and_how_long_it_will_take(tmp_path: Path) -> None:

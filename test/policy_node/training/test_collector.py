@@ -68,7 +68,7 @@ def test_without_noise_the_policy_acts_alone():
 
 @pytest.mark.parametrize('epsilon', [0.0, 0.3])
 def test_noise_has_the_spread_and_the_share_asked_for(epsilon):
-    episodes, _ = make_collector(0.1, epsilon, envs=40).collect(RestingPolicy(4))
+    episodes, _ = make_collector(0.1, epsilon, envs=20).collect(RestingPolicy(4))
     actions = episodes.action.reshape(-1, 4)
     assert np.abs(actions).max() <= 1.0
     # Five standard deviations of the Gaussian; a uniform action stays inside with 0.5 ** 4.

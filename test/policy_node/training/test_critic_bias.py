@@ -36,13 +36,13 @@ def test_returns_go_on_as_the_last_ticks_were():
 def test_a_critic_that_overestimates_is_shown(tmp_path, capsys):
     """An untrained actor always fails: the return of its actions is -1/(1 - gamma)."""
     run = saved_run(tmp_path, value=-3.0)
-    found = measure(run, episodes=4)
+    found = measure(run, episodes=2)
     assert [each.tick for each in found] == [0, 12, 25]
     assert all(each.value == pytest.approx(-3.0) for each in found)
     returns = [each.episode_return for each in found]
     assert returns == pytest.approx([-50.0] * 3, abs=2.0)
     assert np.isnan(found[0].correlation)
-    assert main([str(run), '--episodes', '4']) == 0
+    assert main([str(run), '--episodes', '2']) == 0
     assert 'correlation' in capsys.readouterr().out
 
 

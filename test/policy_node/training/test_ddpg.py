@@ -133,12 +133,12 @@ def test_it_finds_the_best_action(layer_norm, precision):
         layer_norm, precision=precision, gamma=0.0, action_l2=0.0, learning_rate=3e-3
     )
     generator = np.random.default_rng(0)
-    for _ in range(600):
-        goal = generator.uniform(-0.7, 0.7, (256, 2)).astype(np.float32)
-        action = generator.uniform(-1, 1, (256, 2)).astype(np.float32)
-        nothing = np.zeros((256, 3), np.float32)
+    for _ in range(300):
+        goal = generator.uniform(-0.7, 0.7, (128, 2)).astype(np.float32)
+        action = generator.uniform(-1, 1, (128, 2)).astype(np.float32)
+        nothing = np.zeros((128, 3), np.float32)
         reward = -np.square(action - goal).sum(axis=1).clip(0, 1)
-        no_future = np.zeros(256, np.float32)
+        no_future = np.zeros(128, np.float32)
         learner.update(Transitions(nothing, nothing, goal, action, reward, no_future))
     goal = generator.uniform(-0.7, 0.7, (256, 2))
     action, _ = learner.actor.predict({'observation': np.zeros((256, 3)), 'desired_goal': goal})

@@ -72,7 +72,7 @@ def test_what_is_imagined_lies_halfway_by_value():
 def test_the_actor_is_drawn_to_what_it_does_for_the_subgoal():
     """Values here say nothing of actions, so the prior alone moves the actor."""
     learner, generator = learner_of(subgoal_prior=5.0), np.random.default_rng(0)
-    batch = on_a_line(generator, 512)
+    batch = on_a_line(generator, 64)
     known = learner.tensors(batch)
 
     def distance():

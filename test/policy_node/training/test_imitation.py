@@ -77,8 +77,8 @@ def test_the_newest_answers_are_kept():
 
 def test_a_run_writes_a_policy_with_past_actions(tmp_path):
     run = tmp_path / 'run'
-    arguments = ['--task', 'FetchReach', '--recipe', 'robust', '--steps', '1600']
-    small = options_of(updates_per_cycle=10, evaluation_episodes=16, num_envs=16)
+    arguments = ['--task', 'FetchReach', '--recipe', 'robust', '--steps', '800']
+    small = options_of(updates_per_cycle=10, evaluation_episodes=8, num_envs=8, batch_size=64)
     assert main([*arguments, *small, '--threads', '1', '--output', str(run)]) == 0
     actor, info = checkpoint.load(run / 'best.safetensors')
     assert (info.past_actions, info.init_from['name']) == (4, 'FetchReach')

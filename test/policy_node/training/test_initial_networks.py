@@ -32,6 +32,7 @@ from support.runs import SMALL, one_line, options_of, same, small
 # One cycle of two simulations.
 TINY = SMALL | {'num_envs': 2, 'updates_per_cycle': 3, 'batch_size': 32, 'evaluation_episodes': 2}
 TINY |= {'hidden_sizes': (32, 32), 'evaluate_every': 50_000}
+SHIPPED = {'hidden_sizes': (256, 256, 256)}
 SET = options_of(**TINY)
 BLOCK = 'HandManipulateBlockRotateXYZ'
 
@@ -166,7 +167,7 @@ def test_without_targets_a_run_starts_from_the_networks_themselves(tmp_path, blo
 
 @pytest.mark.parametrize('task', ['FetchPush', 'HandManipulateBlockRotateZ'])
 def test_past_actions_that_become_inputs_change_no_action_at_first(tmp_path, task):
-    config = tiny(task, past_actions=2, hidden_sizes=(256, 256, 256))
+    config = tiny(task, past_actions=2, **SHIPPED)
     networks = read_initial_networks(task).fitted(config)
     learner = start(tmp_path, config, networks).learner
     rng, before, spec = np.random.default_rng(0), load_actor(task, task), TASKS[task]
@@ -246,7 +247,7 @@ def test_networks_whose_tensors_do_not_fit_are_one_line(tmp_path, block_run, cap
 
 def test_normalisers_of_an_actor_continue_with_its_statistics(tmp_path):
     networks = read_initial_networks('FetchReach')
-    trainer = start(tmp_path, small(), networks)
+    trainer = start(tmp_path, small(**SHIPPED), networks)
     before = {name: value.clone() for name, value in trainer.learner.actor.state_dict().items()}
     actor = trainer.learner.actor
     trainer.experience.normalize(trainer.collector.collect(actor)[0], actor)
@@ -260,8 +261,8 @@ def test_normalisers_of_an_actor_continue_with_its_statistics(tmp_path):
 def test_an_actor_alone_acts_from_the_first_cycle_while_its_critic_learns(tmp_path, capsys):
     actor = tmp_path / 'alone.safetensors'
     shutil.copy(shipped_actors()['FetchReach'], actor)
-    fields = options_of(**SMALL | {'num_envs': 20, 'evaluation_episodes': 20})
-    arguments = ['--task', 'FetchReach', '--init-from', str(actor), '--steps', '2000', *fields]
+    arguments = ['--task', 'FetchReach', '--init-from', str(actor), '--steps', '800']
+    arguments += options_of(**SMALL | SHIPPED)
     assert main([*arguments, '--output', str(tmp_path / 'run')]) == 0
     assert 'has no critic for this run' in capsys.readouterr().err
     rows = read_progress(tmp_path / 'run/progress.csv')

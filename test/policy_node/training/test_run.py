@@ -39,8 +39,7 @@ from support.runs import (
     weights,
 )
 
-SET = options_of(**SMALL | {'evaluate_every': 1_000})
-REACH = ['--task', 'FetchReach', *SET]
+REACH = ['--task', 'FetchReach', *options_of(**SMALL | {'evaluate_every': 1_000})]
 
 
 class StopAfter:
@@ -248,7 +247,7 @@ def test_a_file_system_without_locks_takes_runs(tmp_path, monkeypatch, capsys):
 
 @pytest.fixture
 def start_run(tmp_path):
-    """Starts a long run in `run` and waits until it has logged two cycles."""
+    """Starts a long run in `run` and waits until it has logged a cycle."""
     run = tmp_path / 'run'
     arguments = [*REACH, '--steps', '100000000', '--output', str(run)]
     command = [sys.executable, '-m', 'policy_node.training.train_her', *arguments]
@@ -261,7 +260,7 @@ def start_run(tmp_path):
         started.append(process := subprocess.Popen(command, env=environment, **streams))
         deadline = time.monotonic() + 90
         log = run / 'progress.csv'
-        while not log.is_file() or log.read_text().count('\n') < 3:
+        while not log.is_file() or log.read_text().count('\n') < 2:
             assert process.poll() is None and time.monotonic() < deadline
             time.sleep(0.05)
         return process
@@ -275,7 +274,7 @@ def start_run(tmp_path):
 def assert_is_saved(run):
     """The state is as new as the log, and all files are there."""
     steps, counters = read_progress(run / 'progress.csv')[-1]['env_steps'], counters_of(run)
-    assert counters['env_steps'] == steps >= 800 and counters['updates'] == steps / 100
+    assert counters['env_steps'] == steps >= 400 and counters['updates'] == steps / 100
     assert (run / 'replay.safetensors').is_file() and (run / 'curve.png').is_file()
 
 
@@ -303,7 +302,7 @@ def test_a_closed_terminal_keeps_the_run(tmp_path, start_run):
     os.close(its_other_end)
     os.close(terminal)
     log, deadline = tmp_path / 'run' / 'progress.csv', time.monotonic() + 90
-    wanted = len(read_progress(log)) + 3
+    wanted = len(read_progress(log)) + 2
     while len(read_progress(log)) < wanted:
         assert process.poll() is None and time.monotonic() < deadline, 'it ended with its terminal'
         time.sleep(0.05)
@@ -328,7 +327,7 @@ def test_a_full_disk_leaves_no_partial_file_and_the_checkpoint_before(tmp_path, 
     trainer = trainer_of(tmp_path, total_steps=2_000, checkpoint_seconds=0, evaluate_every=1_000)
     trainer.save()
     before = (tmp_path / STATE).read_bytes()
-    for size in (1_000, 700_000):
+    for size in (1_000, 30_000):
         with files_at_most(size), pytest.raises(OSError):
             trainer.train()
         assert 'no checkpoint, the one before is kept: ' in capsys.readouterr().err

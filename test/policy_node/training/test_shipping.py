@@ -92,7 +92,9 @@ def test_a_robust_actor_is_shipped_beside_the_usual_one_and_evaluated_with_its_d
     actors = tmp_path / 'actors'
     robust = tmp_path / 'robust'
     train_run(
-        recipe_config('FetchReach', 'robust', **SMALL, total_steps=800),
+        recipe_config(
+            'FetchReach', 'robust', **SMALL | {'hidden_sizes': (256, 256, 256), 'total_steps': 800}
+        ),
         robust,
         caller=Caller(quiet=True),
     )

@@ -24,6 +24,7 @@ from support import runs, script_environment
 for _library in ('matplotlib', 'tensorboard'):
     pytest.importorskip(_library)
 from policy_node.training import Run, train  # noqa: E402
+from policy_node.training.train_her import main  # noqa: E402
 
 SMALL = runs.SMALL | {'quiet': True}
 
@@ -68,9 +69,13 @@ def test_a_warning_names_rewards_above_0(tmp_path, capfd, monkeypatch):
     assert 'within -1 ... 0' in line
 
 
-def test_the_record_contains_all_arguments(tmp_path):
+def test_the_record_contains_all_arguments_of_each_part(tmp_path):
+    """A part that was killed before it saved anything does not count, nor one without a step."""
+    (tmp_path / 'command.txt').write_text('fetch_hand_sim train of before\n')
     train('FetchReach', tmp_path, recipe='best', total_steps=400, goals='future=.8', **SMALL)
-    train('FetchReach', tmp_path, resume=True, gamma=np.float64(0.9), total_steps=800, quiet=True)
+    more = {'gamma': np.float64(0.9), 'total_steps': 800}
+    train('FetchReach', tmp_path, resume=True, **more, quiet=True)
+    train('FetchReach', tmp_path, resume=True, total_steps=800, quiet=True)
     named = {'recipe': 'best', 'total_steps': 400, 'goals': {'future': 0.8}, **runs.SMALL}
     first = ''.join(f', {name}={value!r}' for name, value in named.items())
     assert (tmp_path / 'command.txt').read_text().splitlines() == [
@@ -82,14 +87,8 @@ def test_the_record_contains_all_arguments(tmp_path):
 def test_the_function_trains_as_the_command(tmp_path):
     """Bit for bit."""
     run = train('FetchReach', tmp_path / 'function', total_steps=800, overlap=False, **SMALL)
-    command = [sys.executable, '-m', 'policy_node.training.train_her', '--task', 'FetchReach']
-    command += [
-        *runs.options_of(**runs.SMALL),
-        '--set=overlap=false',
-        '--steps=800',
-        f'--output={tmp_path / "command"}',
-    ]
-    subprocess.run(command, check=True, env=script_environment(), timeout=120)
+    fields = runs.options_of(**runs.SMALL, overlap=False, total_steps=800)
+    assert main(['--task=FetchReach', *fields, f'--output={tmp_path / "command"}']) == 0
     zeros = {'observation': np.zeros(10), 'achieved_goal': np.zeros(3), 'desired_goal': np.ones(3)}
     ours, theirs = (
         load_policy(folder / 'latest.safetensors').policy.predict(zeros)[0]

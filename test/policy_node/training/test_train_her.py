@@ -84,12 +84,11 @@ def test_the_same_seed_gives_the_same_weights_bit_for_bit(tmp_path, overlap):
 
 
 def test_the_latest_actor_is_the_averaged_one_that_evaluations_measure(tmp_path):
-    run = tmp_path / 'run'
-    assert main([*RUN, '--set', 'actor_average=.9', '--output', str(run)]) == 0
-    state = weights(run / STATE)
+    trained(tmp_path, total_steps=800, actor_average=0.9)
+    state = weights(tmp_path / STATE)
     name = 'output.weight'
     assert not torch.equal(state[f'average_actor.{name}'], state[f'actor.network.{name}'])
-    latest = checkpoint.load(run / 'latest.safetensors')[0]
+    latest = checkpoint.load(tmp_path / 'latest.safetensors')[0]
     assert torch.equal(latest.network.state_dict()[name], state[f'average_actor.{name}'])
 
 
@@ -264,17 +263,6 @@ def test_networks_whose_files_could_not_be_read_are_refused_at_once(tmp_path):
         trainer_of(tmp_path, hidden_sizes=(4096, 4096))
 
 
-def test_a_restarted_run_has_one_part(tmp_path):
-    """One that was killed before it had saved anything does not count."""
-    (tmp_path / 'command.txt').write_text('fetch_hand_sim train of before\n')
-    train_run(small(total_steps=800), tmp_path, command='fetch_hand_sim train of now')
-    assert (tmp_path / 'command.txt').read_text() == 'fetch_hand_sim train of now\n'
-    train_run(small(total_steps=1600), tmp_path, resume=True, command='more')
-    assert (tmp_path / 'command.txt').read_text() == 'fetch_hand_sim train of now\nmore\n'
-    train_run(small(total_steps=1600), tmp_path, resume=True, command='nothing to do')
-    assert (tmp_path / 'command.txt').read_text() == 'fetch_hand_sim train of now\nmore\n'
-
-
 def test_a_new_run_sets_the_files_of_an_earlier_one_aside(tmp_path, capsys):
     """Otherwise the best actor of the earlier run would stay, even of another task."""
     (tmp_path / 'tensorboard').mkdir()
@@ -373,7 +361,7 @@ def test_bad_usage_is_one_line_and_exit_status_2(arguments, message, capsys, tmp
 @pytest.fixture(scope='module')
 def saved_run(tmp_path_factory):
     folder = tmp_path_factory.mktemp('saved')
-    trainer_of(folder, strategy='none', hidden_sizes=(8, 8)).save()
+    trainer_of(folder, strategy='none').save()
     return folder
 
 
@@ -390,7 +378,7 @@ def saved_run(tmp_path_factory):
         (['--condition', 'horizon'], "condition 'none', which cannot change to 'horizon'"),
         (['--subgoal-every', '5'], 'subgoal_every 0, which cannot change to 5'),
         (['--longest-hold', '20'], 'longest_hold 1, which cannot change to 20'),
-        (['--hidden-sizes', '9,9'], 'hidden_sizes (8, 8), which cannot change to (9, 9)'),
+        (['--hidden-sizes', '9,9'], 'hidden_sizes (16, 16), which cannot change to (9, 9)'),
         (['--seed', '9'], 'seed 0, which cannot change to 9'),
         (['--critics', '2'], 'critics 1, which cannot change to 2'),
         (['--goal-features', 'relative'], "goal_features 'plain', which cannot change"),
