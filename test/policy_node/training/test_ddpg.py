@@ -122,8 +122,6 @@ def test_the_actor_update_leaves_the_critic_alone_and_normalizers_untouched():
     ('layer_norm', 'precision'),
     [
         (False, 'float32'),
-        pytest.param(True, 'float32', marks=pytest.mark.release),
-        pytest.param(False, 'bfloat16', marks=pytest.mark.release),
         pytest.param(True, 'bfloat16', marks=pytest.mark.release),
     ],
 )
