@@ -154,16 +154,6 @@ def test_episodes_that_were_asked_for_and_not_logged_are_a_failure(start_process
     assert output.splitlines()[-1] == f'sim_node: not all episodes are in {disk}'
 
 
-def test_a_read_only_disk(start_process, mount):
-    disk = mount('size=100m', 'ro')
-    robot = start_process(*SIM_NODE, *ros_args(episode_dir=disk / 'episodes'))
-    with client(REACH) as listener:
-        listener.subscribe('joint_states')
-        ticks_after(listener, 10)
-    (error,) = error_lines(stop(robot))
-    assert 'Read-only file system' in error
-
-
 def test_a_directory_that_is_removed_while_it_is_written(start_process, tmp_path):
     directory = tmp_path / 'episodes'
     # Slow: between two episodes nothing is written, and the directory would be made anew.

@@ -8,7 +8,6 @@ import signal
 import subprocess
 import sys
 import tempfile
-import time
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -46,7 +45,6 @@ LOG = 'fetch_hand_sim.episode_log'
 RECORDER_SCRIPT = SUPPORT / 'episode_recorder.py'
 NOBODY = 65534
 TICK_NS = 40_000_000
-# Every message goes to the disk at once, so that errors come where they are caused.
 
 
 @pytest.fixture(scope='module')
@@ -459,16 +457,6 @@ def test_files_that_are_no_episodes_are_rejected_by_all_readers(tmp_path):
             assert str(path) in str(caught.value)
             assert_one_line(caught.value)
     assert find_episodes(tmp_path) == sorted(tmp_path.glob('*.mcap'))
-
-
-def test_writing_costs_little_of_a_tick(tmp_path, recorder, ticks):
-    """A loose bound: a tick of 10 messages takes 0.1 ms of 40 ms on an idle machine."""
-    writer = EpisodeWriter(tmp_path, 'episode', {})
-    started = time.process_time()
-    recorder.write(writer, ticks)
-    per_tick = (time.process_time() - started) / len(ticks)
-    writer.finish({})
-    assert per_tick < 0.005
 
 
 def test_a_robot_that_begins_its_file_while_the_rest_is_cleared_away_keeps_it(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import shutil
 from pathlib import Path
 
 from fetch_hand_sim.commands import episodes_check, episodes_list
@@ -27,6 +26,7 @@ def test_it_reads_and_loads():
     episode, summary = read_episode(EPISODE), read_summary(EPISODE)
     assert episode.is_complete and summary.is_complete
     assert summary.message_count == sum(len(t.messages) for t in episode.topics.values()) == 509
+    assert summary.size_bytes == FILE.stat().st_size
     (arrays,) = load_episodes(EPISODE)
     assert arrays.observations['observation'].shape == (51, 10)
     assert float(arrays.result['return']) == arrays.rewards.sum()
@@ -47,4 +47,3 @@ def test_cut_off_it_is_recovered(tmp_path):
     path = recover_episode(leftover)
     result = check_episode(path)
     assert result.difference is None and result.ticks > 20
-    shutil.rmtree(path)
