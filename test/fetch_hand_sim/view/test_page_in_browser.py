@@ -356,7 +356,7 @@ def switch_on(browser: Browser, robot: Client, switch: tuple[float, float]) -> N
         browser.click(*switch)
         end = time.monotonic() + PATIENCE / 3
         while time.monotonic() < end:
-            robot.spin(1.0)
+            robot.spin(0.1)
             if robot.node.count_publishers('/commands') == 1:
                 return
     keep('without commands', browser.screenshot())
