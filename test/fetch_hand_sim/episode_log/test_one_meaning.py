@@ -223,7 +223,7 @@ def with_channels_in_the_summary(parts):
     return whole(parts.record, content, parts.result, summary=parts.channels)
 
 
-# What a file has, the reason why readers reject it, and how to make it.
+# Rows: name, reason of the rejection, function that makes the file.
 AMBIGUOUS = [
     ('second channel', "2 channels of topic '/reward'", with_reward_of_two_channels),
     ('redefined', 'channel 1 is defined twice', lambda p: p.file(chunk(channel(1, 1, '/zzz')))),
