@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import copy
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
@@ -92,40 +92,14 @@ class CriticLoss:
         return values
 
 
-class TargetNetworks:
-    """Target networks: copies of actor and critic that follow them slowly."""
-
-    def __init__(self, actor: MLP, critic: nn.Module) -> None:
-        self.actor, self.critic = copy.deepcopy(actor), copy.deepcopy(critic)
-
-    @torch.no_grad()
-    def move(self, learner: DDPG) -> None:
-        """Move the target networks towards the networks of `learner` by the share 1 - `polyak`."""
-        weight = 1.0 - learner.config.polyak
-        copies = learner.target_actor, learner.target_critic
-        old: list[Tensor] = [each for network in copies for each in network.parameters()]
-        new: list[Tensor] = [*learner.actor_parameters, *learner.critic_parameters]
-        torch._foreach_lerp_(old, new, weight)
-
-    def modules(self) -> dict[str, nn.Module]:
-        """Return the target networks to save in the training state, by name."""
-        return {'target_actor': self.actor, 'target_critic': self.critic}
-
-
-@dataclass(frozen=True, slots=True)
-class Parts:
-    """Exchangeable parts of `DDPG`: the loss of the critic and the class of target networks."""
-
-    critic_loss: CriticLoss = field(default_factory=CriticLoss)
-    targets: type[TargetNetworks] = TargetNetworks
-
-
 class DDPG(ActorCritic):
-    """Learner of deep deterministic policy gradient, with target networks.
+    """Learner of deep deterministic policy gradient.
+
+    With `target=none`, the target networks are the networks themselves.
 
     Args:
         workers: Processes that train together; gradients are averaged over them.
-        parts: Exchangeable parts; None takes those of the paper.
+        critic_loss: Critic and its loss; None takes those of the paper.
     """
 
     def __init__(
@@ -134,16 +108,18 @@ class DDPG(ActorCritic):
         config: TrainConfig,
         device: torch.device,
         workers: Workers,
-        parts: Parts | None = None,
+        critic_loss: CriticLoss | None = None,
     ) -> None:
-        self.parts = parts or Parts()
         self.config = config
-        self.critic_loss = self.parts.critic_loss
+        self.critic_loss = critic_loss or CriticLoss()
         actor, critic = self._make_networks(shape)
         # A batch normalization updates its statistics only in the update of the critic.
         super().__init__(actor, critic.eval(), config, device, workers)
-        self._targets = self.parts.targets(self.actor.network, self.critic)
-        self.target_actor, self.target_critic = self._targets.actor, self._targets.critic
+        self.target_actor, self.target_critic = self.actor.network, self.critic
+        self._has_targets = config.target == 'polyak'
+        if self._has_targets:
+            self.target_actor = copy.deepcopy(self.target_actor)
+            self.target_critic = copy.deepcopy(self.target_critic)
         self._bfloat16 = uses_bfloat16(config.precision, device)
         # Loss and value of the last update of the actor.
         self._of_actor = (torch.zeros((), device=device),) * 2
@@ -165,9 +141,17 @@ class DDPG(ActorCritic):
         if self.updates % self.config.policy_delay == 0:
             self._of_actor = self._update_actor(tensors)
         self.updates += 1
-        if self.updates % self.config.target_update_interval == 0:
-            self._targets.move(self)
+        if self._has_targets and self.updates % self.config.target_update_interval == 0:
+            self._move_targets()
         return Losses(critic_loss, *self._of_actor)
+
+    @torch.no_grad()
+    def _move_targets(self) -> None:
+        """Move the target networks towards the networks by the share 1 - `polyak`."""
+        weight = 1.0 - self.config.polyak
+        old: list[Tensor] = [*self.target_actor.parameters(), *self.target_critic.parameters()]
+        new: list[Tensor] = [*self.actor_parameters, *self.critic_parameters]
+        torch._foreach_lerp_(old, new, weight)
 
     def tensors(self, batch: Transitions) -> TensorBatch:
         """Convert a batch to tensors and compute the network inputs of both states."""
@@ -240,7 +224,8 @@ class DDPG(ActorCritic):
 
     def modules(self) -> dict[str, nn.Module]:
         """Return the modules to save in the training state, by name."""
-        return {**super().modules(), **self._targets.modules()}
+        targets = {'target_actor': self.target_actor, 'target_critic': self.target_critic}
+        return super().modules() | (targets if self._has_targets else {})
 
     def precision(self) -> contextlib.AbstractContextManager[None]:
         """Return a context in which matrix products use bfloat16 if the run does."""

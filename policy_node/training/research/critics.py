@@ -1,4 +1,4 @@
-"""Other critics: ensembles, quantiles, batch normalization, advantages, no target networks."""
+"""Other critics: ensembles, quantiles, batch normalization, advantages."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ from policy_node.training.learners.ddpg import (
     DDPG,
     Critic,
     CriticLoss,
-    TargetNetworks,
     TensorBatch,
 )
 
@@ -197,20 +196,6 @@ def critic_loss(options: Critics) -> CriticLoss:
     if options.quantiles > 1:
         return QuantileLoss(options)
     return BatchNormLoss(options) if options.norm == 'batch' else EnsembleLoss(options)
-
-
-class NoTargets(TargetNetworks):
-    """Uses the online networks where `TargetNetworks` uses slowly moving copies."""
-
-    def __init__(self, actor: MLP, critic: nn.Module) -> None:
-        self.actor, self.critic = actor, critic
-
-    def move(self, learner: DDPG) -> None:
-        """Do nothing: there are no target networks to update."""
-
-    def modules(self) -> dict[str, nn.Module]:
-        """Return no modules: the learner itself saves the online networks."""
-        return {}
 
 
 class AdvantageCritic(nn.Module):

@@ -268,7 +268,7 @@ class HighLevel(DDPG):
         # A penalty of large actions would prefer goals in the middle of all goals.
         config = replace(low.config, action_l2=0.0)
         shape = replace(shape, action_size=shape.goal_size)
-        super().__init__(shape, config, low.device, low.workers, low.parts)
+        super().__init__(shape, config, low.device, low.workers, low.critic_loss)
         self.actor.observation_normalizer = low.actor.observation_normalizer
         self.actor.goal_normalizer = low.actor.goal_normalizer
         self._is_pose = task_spec(config.task).goal is GoalKind.POSE

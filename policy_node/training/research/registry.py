@@ -21,7 +21,7 @@ from policy_node.training.experience.replay import Weigh, has_moved
 from policy_node.training.experience.sampling import TransitionSampler, sampler_fields
 from policy_node.training.learners import actor_critic
 from policy_node.training.learners.actor_critic import ActorCritic
-from policy_node.training.learners.ddpg import DDPG, Parts, TargetNetworks
+from policy_node.training.learners.ddpg import DDPG
 from policy_node.training.learners.imagined import ImaginingDDPG
 from policy_node.training.machine import Workers
 from policy_node.training.research import (
@@ -150,9 +150,7 @@ def make_ddpg(
 ) -> DDPG:
     """Return `DDPG` or the learner that takes its place; arguments as `DDPG`."""
     kinds = (kind for name, kind in _LEARNERS.items() if getattr(config, name) != DEFAULTS[name])
-    targets = critics.NoTargets if config.target == 'none' else TargetNetworks
-    parts = Parts(critics.critic_loss(config), targets)
-    return next(kinds, DDPG)(shape, config, device, workers, parts)
+    return next(kinds, DDPG)(shape, config, device, workers, critics.critic_loss(config))
 
 
 def network_shape(config: TrainConfig) -> NetworkShape:
