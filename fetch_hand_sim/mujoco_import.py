@@ -10,7 +10,11 @@ from importlib import import_module
 
 
 def import_mujoco() -> None:
-    """Import MuJoCo now if `MUJOCO_GL` could make its import fail; the variable stays as it is."""
+    """Import MuJoCo even if its OpenGL backend `MUJOCO_GL` does not work.
+
+    A failed import is repeated without OpenGL, so that only rendering reports the backend. The
+    variable keeps its value. Nothing is imported if it is not set.
+    """
     asked = os.environ.get('MUJOCO_GL', '')
     if not asked or 'mujoco' in sys.modules:
         return

@@ -176,7 +176,7 @@ class PhysicsDisturbance(_Group):
         gain: Factor of the gain of the position actuators (hand, gripper fingers).
         force_limit: Factor of the largest actuator force (hand).
         damping: Factor of the damping of the driven joints (hand).
-        gravity_tilt: Largest angle between gravity and the vertical, rad.
+        gravity_tilt: Angle between gravity and the vertical, rad; its direction is random.
         table_height: Shift of the table and of what stands on it, m (Fetch).
     """
 

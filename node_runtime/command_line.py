@@ -71,7 +71,10 @@ class CommandParser(argparse.ArgumentParser):
         sys.exit(EXIT_USAGE)
 
     def _print_message(self, message: str, file: Any = None) -> None:
-        """Print help; argparse itself ignores or traces a closed output."""
+        """Print help; exit with an error if the output cannot be written.
+
+        argparse would ignore that, or print a traceback.
+        """
 
         def write() -> int:
             print(message, end='', file=file or sys.stderr)

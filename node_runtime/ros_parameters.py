@@ -107,7 +107,10 @@ def set_callback(
 
 
 def _serve_parameter_requests(node: Node) -> None:
-    """Offer the parameter services; reject unknown types, which end a node of plain rclpy."""
+    """Offer the parameter services, which reject parameters of an unknown type.
+
+    The services of rclpy raise an exception there, which ends the node.
+    """
     from rcl_interfaces.srv import SetParameters
     from rclpy.parameter_service import ParameterService
 

@@ -183,7 +183,7 @@ class MessageIndex(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class MetadataRecord:
-    """A metadata record; `index` is the content of its index."""
+    """A metadata record; `index` is the body of the index record that lists it."""
 
     index: bytes
     name: str
@@ -192,7 +192,7 @@ class MetadataRecord:
 
 @dataclass(frozen=True, slots=True)
 class AttachmentRecord:
-    """An attachment; `index` is the content of its index."""
+    """An attachment; `index` is the body of the index record that lists it."""
 
     index: bytes
     name: str

@@ -151,7 +151,11 @@ def _masks_match(model: mujoco.MjModel, first: int, second: int) -> bool:
 
 
 def _bodies_may_collide(model: mujoco.MjModel, first: int, second: int) -> bool:
-    """Return False within a rigid body, for parent and child (except the world), and excludes."""
+    """Return whether MuJoCo tests two bodies for collision.
+
+    It does not if they are welded together, are parent and child (unless the parent is the world),
+    or are excluded in the model.
+    """
     bodies = sorted((int(model.geom_bodyid[first]), int(model.geom_bodyid[second])))
     if (bodies[0] << 16) + bodies[1] in model.exclude_signature:
         return False

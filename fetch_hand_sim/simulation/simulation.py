@@ -192,7 +192,9 @@ class Simulation:
         return self._task.batch.get_data(self._index(index))
 
     def read_data(self, index: int, data: Any) -> None:
-        """Write simulation `index` into a `mujoco.MjData`; derived fields need `keeps_data`.
+        """Copy the state of simulation `index` into a `mujoco.MjData`.
+
+        What MuJoCo derives from the state, such as contacts, is copied only with `keeps_data`.
 
         Goals, random generators and divergence counters are not included, as in `write_data`.
         """
@@ -546,7 +548,7 @@ class Simulation:
 
     @property
     def _pushes(self) -> Array:
-        """External wrenches on the bodies, (N, bodies, 6), live."""
+        """External wrenches on the bodies, (N, bodies, 6): a view, so writing applies them."""
         pushes: Array = self._task.batch.bind('xfrc_applied')
         return pushes
 

@@ -122,9 +122,11 @@ def _nodes(
 
 
 def _check_is_wanted(options: argparse.Namespace, spec: TaskSpec, where: str) -> None:
-    """Raise NodeFailure if the running robot has another task than `options.task`.
+    """Check that the running robot fits the options; `where` is its namespace, for errors.
 
-    Raise UsageError if options are given that only a new robot could use.
+    Raises:
+        NodeFailure: If the robot has another task than `options.task`.
+        UsageError: If options are given that only a new robot could use.
     """
     if options.task not in (None, spec.name):
         raise NodeFailure(f'a robot in {where} runs already and does {spec.name}')

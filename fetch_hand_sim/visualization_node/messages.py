@@ -210,7 +210,7 @@ class Camera:
         )
 
     def close(self) -> None:
-        """Free OpenGL; another scene may follow."""
+        """Free the OpenGL context; the camera opens it again at the next picture."""
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None

@@ -25,7 +25,7 @@ class Transform:
 
 
 class Transforms:
-    """The tree of frames of one robot."""
+    """Computes the transforms of one robot for `/tf` and `/tf_static`."""
 
     def __init__(self, task: str, prefix: str = '') -> None:
         self.description = RobotDescription(task)

@@ -55,7 +55,7 @@ def _period(values: Mapping[str, str]) -> float:
 
 
 class Health:
-    """Turn the counters of a responder into reports; `name` is the full name of the node."""
+    """Makes the diagnostics of the node, `name`, from the counters of its responder."""
 
     def __init__(self, name: str) -> None:
         self._name = name

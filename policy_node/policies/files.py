@@ -64,7 +64,7 @@ def write_file(path: Path, data: bytes) -> None:
 def write_files(files: Mapping[Path, bytes]) -> None:
     """Write files that belong together: replace none before all are on disk.
 
-    If two processes write at once, the later file stays, whole.
+    If two processes write at once, each file is whole and comes from the last one.
 
     Raises:
         OSError: If writing fails. The error names the file, and no partial file remains.

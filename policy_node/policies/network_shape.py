@@ -48,7 +48,7 @@ class NetworkShape:
 
     @property
     def input_size(self) -> int:
-        """Length of the observation and the past actions."""
+        """Length of observation and past actions together; the goal is not included."""
         return self.observation_size + self.past_size
 
     @property

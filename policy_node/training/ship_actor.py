@@ -77,7 +77,7 @@ def ship(
     threads: int = 0,
     name: str = BEST_FILE,
 ) -> bool:
-    """Evaluate an actor of a run and copy it with its files if it beats the shipped actor.
+    """Evaluate an actor of a run; copy it with its files if its success rate is the higher one.
 
     Args:
         run: Folder of the run.
@@ -90,8 +90,7 @@ def ship(
 
     Raises:
         ValueError: If the actor or its log is missing or damaged, or the shipped actor has another
-            action frequency or was evaluated on more episodes. A few episodes may all succeed by
-            chance.
+            action frequency or was evaluated on more episodes.
         UsageError: If the folder cannot be written.
     """
     file = run / name

@@ -34,12 +34,12 @@ def load_hand_model(asset: str) -> mujoco.MjModel:
 
 
 def fingertip_sites(model: mujoco.MjModel) -> NDArray[np.intp]:
-    """Return the site indices of the fingertips in the order of goals."""
+    """Return the site indices of the fingertips, in the order in which a goal lists them."""
     return np.array([model.site(f'robot0:S_{name}').id for name in FINGERTIPS], dtype=np.intp)
 
 
 class HandTask(Task):
-    """Base of the hand tasks."""
+    """What HandReach and the manipulation tasks share: actions, resting commands, fingertips."""
 
     def __init__(self, spec: TaskSpec, model: mujoco.MjModel, batch: BatchConfig) -> None:
         super().__init__(spec, model, batch)
@@ -53,7 +53,10 @@ class HandTask(Task):
         self._sensors['fingertip_poses'] = HandTask._fingertip_poses
 
     def follow_model(self) -> None:
-        """Follow the model; actions span `actuator_ctrlrange` once it was written to."""
+        """Step with the present `model`.
+
+        If the user has changed its `actuator_ctrlrange`, actions in [-1, 1] span the new range.
+        """
         super().follow_model()
         ranges = self.model.actuator_ctrlrange
         self._scaled_robot = self.spec.robot

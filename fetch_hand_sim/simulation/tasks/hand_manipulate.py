@@ -105,7 +105,7 @@ class HandManipulateTask(HandTask):
 
     @property
     def asset(self) -> str:
-        """The MJCF asset."""
+        """Path of the MJCF file below the assets folder of Gymnasium-Robotics."""
         return self.config.asset
 
     def reset(self, ids: Ids, generators: Generators) -> Array:

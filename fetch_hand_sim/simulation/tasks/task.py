@@ -110,7 +110,7 @@ class BatchConfig:
 
     @property
     def substeps(self) -> int:
-        """Physics steps per action; ValueError for other rates."""
+        """Physics steps per action; ValueError unless `control_hz` is 500/n, n = 1 ... 40."""
         return substeps_per_tick(self.control_hz)
 
     @property
@@ -295,7 +295,10 @@ class Task(ABC):
         return data
 
     def read_data(self, index: int, data: mujoco.MjData) -> None:
-        """Write simulation `index` into `data`; derived values need `keeps_data`."""
+        """Copy the state of simulation `index` into `data`.
+
+        What MuJoCo derives from the state, such as contacts, is copied only with `keeps_data`.
+        """
         self.batch.get_data(index, data)
         # The `MjData` of a copy that has not stepped yet is newer than the task's outputs.
         for name, values in self._outputs.items():

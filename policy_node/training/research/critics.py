@@ -97,7 +97,7 @@ class EnsembleLoss(CriticLoss):
 class QuantileLoss(EnsembleLoss):
     """Quantile regression as in QR-DQN (Dabney et al. 2018, arXiv 1710.10044).
 
-    Targets with `truncated` drop the highest quantiles of all critics together, as TQC (Kuznetsov
+    If `truncated`, targets leave out the highest quantiles of all critics, as TQC (Kuznetsov
     et al. 2020, arXiv 2005.04269).
     """
 

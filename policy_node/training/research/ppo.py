@@ -34,8 +34,8 @@ class RolloutTransitions(Transitions):
     """Transitions of the newest rollouts.
 
     Attributes:
-        log_probability: (batch,) of the action, by the actor before the first update that uses the
-            rollouts. Its normalizers include the new episodes, which matters in the first cycles.
+        log_probability: (batch,) of the action, for the actor before the first update on these
+            rollouts. Its normalizers include the new episodes already.
         advantage: (batch,) of the action, with standard deviation 1.
         value_target: (batch,) target value of the state.
         weight: (batch,) weight of the transition in all losses.

@@ -226,10 +226,11 @@ def goals_in_hindsight(
     generator: np.random.Generator,
     outcomes: Outcomes | None = None,
 ) -> Array32:
-    """Return a goal for each whole episode, (episodes, goal_size), from the sources of a mixture.
+    """Draw a goal for each whole episode, (episodes, goal_size).
 
     Args:
-        outcomes: Outcomes of other episodes for the source `outcome`.
+        mixture: Probability of each goal source: `future`, `final`, `actual`, ..., `outcome`.
+        outcomes: Goals that other episodes have achieved, for the source `outcome`.
     """
     count = len(episodes)
     starts = Starts(episodes, np.arange(count), np.zeros(count, np.int64))

@@ -47,7 +47,7 @@ class InitialNetworks:
     """Networks and normalizer statistics that a run starts from instead of random ones.
 
     Attributes:
-        tensors: Named as in a training state, without optimizers and random generators.
+        tensors: Weights and normalizer statistics, by their names in a training state.
         shape: Sizes and inputs of the actor.
         goal_features: Value of the field `goal_features` that the networks were trained with.
         origin: Name, task, environment steps and command of their training, for the record.

@@ -392,7 +392,10 @@ class Trainer(BaseTrainer):
         return policy, candidate
 
     def _candidate(self) -> Candidate | None:
-        """Return the actor to evaluate and further policies; None except on the first worker."""
+        """Return the actor to evaluate, and policies to evaluate for `progress.csv` only.
+
+        None except on the first worker.
+        """
         if not self.workers.is_first:
             return None
         return self.learner.evaluation_actor(), self.learner.other_policies()

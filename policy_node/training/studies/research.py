@@ -137,7 +137,7 @@ def _targets() -> Iterator[Arm]:
 
 
 def _ensembles() -> Iterator[Arm]:
-    """Yield one critic, several with each aggregation, quantiles, and more updates per step."""
+    """Yield variants of the critic: one, ensembles by aggregation, quantiles, more updates."""
     yield _arm('one', 'one critic', critics=1)
     for number, pooling in ((2, 'mean'), (2, 'min'), (5, 'mean'), (5, 'min'), (5, 'truncated')):
         label = f'{number} critics, {pooling}'
