@@ -41,7 +41,7 @@ from policy_node.policies.files import write_file
 from policy_node.policies.loading import is_python_name, working_directory_first
 from policy_node.training.configuration.flat import whole, with_assignments
 from policy_node.training.runs.run_folder import BEST_FILE
-from policy_node.training.ship_actor import ship
+from policy_node.training.runs.shipping import ship
 from policy_node.training.studies.best import BEST
 from policy_node.training.studies.published import actors_table
 from policy_node.training.studies.report import write_study

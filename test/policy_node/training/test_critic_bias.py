@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from policy_node.training.critic_bias import discounted, main, measure
+from policy_node.training.critic_bias import main
+from policy_node.training.values_and_returns import discounted, measure
 from support.runs import trainer_of
 
 

@@ -81,7 +81,7 @@ def test_a_folder_that_takes_no_actor_is_refused_before_any_episode(
 ):
     actors = tmp_path / 'actors'
     actors.touch()
-    monkeypatch.setattr('policy_node.training.ship_actor.evaluate', None)
+    monkeypatch.setattr('policy_node.training.runs.shipping.evaluate', None)
     assert ship(run, actors, 2) == 2
     assert 'FetchReach.safetensors cannot be written: ' in one_line(capsys)
 

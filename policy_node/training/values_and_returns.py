@@ -1,0 +1,123 @@
+"""Compare the values of a critic with the returns of its actor in new episodes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from fetch_hand_sim.simulation import Simulation
+from policy_node.training.configuration.config import changed_fields
+from policy_node.training.configuration.flat import changed, config_from_dict
+from policy_node.training.evaluation import FIRST_SEED
+from policy_node.training.experience.hindsight import RewardFunction
+from policy_node.training.learners.actor_critic import ActorCritic
+from policy_node.training.machine import Workers
+from policy_node.training.research.registry import make_sampler
+from policy_node.training.runs.run_folder import STATE_FILE
+from policy_node.training.runs.trainer import Trainer
+from policy_node.training.runs.training_state import load_state, read_state
+
+# Rewards after the episode are taken as the mean of its last ticks.
+_LAST_TICKS = 20
+# Shares of an episode at which values are compared with returns.
+_SHARES = (0.0, 0.25, 0.5)
+# Fields with which values are not those of actions; quantiles have a mean.
+_OTHER_VALUES = ('algorithm', 'longest_hold', 'advantage', 'subgoal_every', 'condition')
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """The critic's values and the returns at one tick, as means over episodes.
+
+    Attributes:
+        tick: Tick of the episodes at which both are taken.
+        value: Value of the actor's action.
+        episode_return: Discounted training rewards from this tick on.
+        correlation: Correlation of both over episodes; NaN if one of them is constant.
+    """
+
+    tick: int
+    value: float
+    episode_return: float
+    correlation: float
+
+
+def measure(run: Path, episodes: int) -> list[Comparison]:
+    """Compare the critic's values with returns in new episodes of a run's actor, without noise.
+
+    `run` is the folder. The actor is the one that collects, not its average. There is one
+    comparison for each of a few ticks of the episodes.
+
+    Raises:
+        ValueError: If the folder contains no run, or its critic returns no action values.
+    """
+    state = read_state(run / STATE_FILE)
+    config = config_from_dict(state.extra['config'])
+    if odd := changed_fields(config, _OTHER_VALUES):
+        raise ValueError(f'{run} has no values of actions: {", ".join(odd)}')
+    few = {'num_envs': episodes, 'evaluation_episodes': 1, 'replay_transitions': 1}
+    config = changed(config, **few, learning_starts=0, device='cpu')
+    trainer = Trainer(config, run, Workers())
+    load_state(run / STATE_FILE, trainer.learner, trainer.modules())
+    sampler = make_sampler(config, trainer.simulation.metric)
+    progress = state.counters.env_steps / config.total_steps
+    compute_reward = sampler.at(progress).compute_reward
+    values, rewards = _play(trainer.simulation, trainer.learner, compute_reward)
+    returns = discounted(rewards * sampler.reward_scale, config.tick_gamma)
+    ticks = [int(share * len(values)) for share in _SHARES]
+    return [_compared(tick, values[tick], returns[tick]) for tick in ticks]
+
+
+def _play(
+    simulation: Simulation, learner: ActorCritic, compute_reward: RewardFunction
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Run an episode in each simulation; return values and rewards, each (ticks, episodes)."""
+    count = simulation.num_envs
+    observation = simulation.reset(seed=[FIRST_SEED + index for index in range(count)])
+    values, rewards = [], []
+    for _ in range(simulation.spec.episode_ticks):
+        value, action = _judge(learner, observation['observation'], observation['desired_goal'])
+        observation = simulation.step(action).observation
+        goals = observation['achieved_goal'], observation['desired_goal']
+        values.append(value)
+        rewards.append(compute_reward(*goals))
+    return np.array(values), np.array(rewards)
+
+
+@torch.no_grad()
+def _judge(
+    learner: ActorCritic, observation: NDArray[np.float64], goal: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the critic's values (episodes,) of the actor's actions, and these actions.
+
+    Actions are (episodes, action size), without noise.
+    """
+    seen, wanted = (learner.tensor(values).float() for values in (observation, goal))
+    features = learner.actor.features(seen, wanted)
+    action = learner.actor(features)
+    value = learner.critic(features, action)
+    if value.ndim > 1:
+        value = value.mean(dim=0)
+    return value.double().numpy(), action.double().numpy()
+
+
+def discounted(rewards: NDArray[np.float64], gamma: float) -> NDArray[np.float64]:
+    """Return the discounted returns (ticks, episodes) from each tick on.
+
+    After the end of an episode, each reward is taken as the mean of its last ticks.
+    """
+    following = rewards[-_LAST_TICKS:].mean(axis=0) / (1.0 - gamma)
+    returns = np.empty_like(rewards)
+    for tick in reversed(range(len(rewards))):
+        returns[tick] = following = rewards[tick] + gamma * following
+    return returns
+
+
+def _compared(tick: int, value: NDArray[np.float64], returns: NDArray[np.float64]) -> Comparison:
+    varies = value.std() > 0.0 and returns.std() > 0.0
+    correlation = float(np.corrcoef(value, returns)[0, 1]) if varies else float('nan')
+    return Comparison(tick, float(value.mean()), float(returns.mean()), correlation)
