@@ -363,10 +363,10 @@ class Camera:
 def write_episodes(
     path: Path, episodes: Sequence[EpisodeArrays], camera: Camera, rate: float
 ) -> list[Histogram]:
-    """Write a film of all frames of episodes except the last of each, which has no action.
+    """Write a film of episodes, without the last frame of each, because no action follows it.
 
     Returns:
-        How often each level of each channel was drawn, (3, 256) for each episode.
+        Number of pixels of each value by colour channel, (3, 256) for each episode.
     """
     studio = Studio(camera.width, camera.height, camera.name)
     histograms = [np.zeros((3, _LEVELS), dtype=np.int64) for _ in episodes]

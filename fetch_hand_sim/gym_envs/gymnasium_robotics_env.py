@@ -469,7 +469,7 @@ def task_with_goals(task: str, position: str | None, rotation: str | None) -> st
 
 
 class GymnasiumRoboticsVectorEnv(FetchHandVectorEnv):
-    """N copies of a task of the reference, with the results of a `SyncVectorEnv` of them."""
+    """N copies of a Gymnasium-Robotics task, with the results of a `SyncVectorEnv` of them."""
 
     def __init__(
         self,

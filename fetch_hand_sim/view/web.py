@@ -81,9 +81,9 @@ class Address:
 
 @dataclass(frozen=True, slots=True)
 class Touch:
-    """Mouse and buttons in one frame; they tell whether the page is in use.
+    """State of mouse and buttons in one frame.
 
-    It is while a button is held or `mouse` changes.
+    The page is in use while a button is held or `mouse` changes from frame to frame.
     """
 
     mouse: tuple[float, float] = (0.0, 0.0)

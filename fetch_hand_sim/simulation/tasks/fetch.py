@@ -206,7 +206,7 @@ class FetchTask(Task):
         return self.config.asset
 
     def reset(self, ids: Ids, generators: Generators) -> Array:
-        """Restore the settled state, place the objects and draw goals."""
+        """Restore the settled state of simulations `ids`, place their objects; return new goals."""
         self.batch.state[ids] = self.start_state
         if self.object_qpos is not None:
             places = [self._sample_object_place(generator) for generator in generators]

@@ -45,7 +45,7 @@ class Teleoperation:
         self._held: int | None = None
 
     def select(self, by: int) -> None:
-        """Select another part, relative to this one."""
+        """Select the part `by` places further in the command, cyclically."""
         self.selected = (self.selected + by) % len(self._parts)
 
     def hold(self, direction: int, seconds: float) -> None:

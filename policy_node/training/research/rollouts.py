@@ -205,7 +205,11 @@ class Outcomes:
         return len(self.after)
 
     def goals(self, starts: Starts, generator: np.random.Generator) -> Array32:
-        """Return a goal for each whole episode, (batch, goal_size); its own without outcomes."""
+        """Return one goal per episode, (batch, goal_size): the outcome nearest to its desired goal.
+
+        A few outcomes of other episodes are drawn and moved to the start of this one. Without
+        outcomes it is the desired goal itself.
+        """
         desired = starts.episodes.desired_goal[starts.row]
         if not len(self):
             return desired
