@@ -262,7 +262,7 @@ def episode_name(task: str, index: int, seed: int) -> str:
 
 
 def next_index(directory: Path, task: str) -> int:
-    """Return the index after the largest of a task, including cut-off episodes; 0 at first."""
+    """Return the largest index of a task plus 1, unfinished episodes included; 0 at first."""
     return max((int(name['index']) + 1 for name in _names(directory, task)), default=0)
 
 

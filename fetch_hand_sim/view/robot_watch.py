@@ -243,7 +243,7 @@ def _spec_of(status: EpisodeStatus) -> TaskSpec:
 
 @dataclass(frozen=True, slots=True)
 class Replay:
-    """A node that replays an episode: fully qualified names of the node and its pause service."""
+    """The fully qualified names of a node that replays an episode and of its pause service."""
 
     name: str
     pause: str

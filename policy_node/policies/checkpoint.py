@@ -163,10 +163,10 @@ def read_info(path: str | Path) -> ActorInfo:
 
 
 def load(path: str | Path, task: str | None = None) -> tuple[Actor, ActorInfo]:
-    """Load an actor as a torch module, and its metadata.
+    """Load an actor as a torch module, and its metadata; arguments as `read`.
 
     Raises:
-        ValueError: As `read`.
+        ValueError: If the file is invalid, of an unknown version, or of another task.
     """
     from policy_node.policies.actor import Actor
 

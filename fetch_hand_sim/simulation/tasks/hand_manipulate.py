@@ -71,7 +71,7 @@ MANIPULATE_CONFIGS = {
 
 
 class HandManipulateTask(HandTask):
-    """HandManipulateBlock*, HandManipulateEgg*, HandManipulatePen*.
+    """The tasks in which the hand turns a block, an egg or a pen.
 
     Attributes:
         parallel_quaternions: (24, 4) wxyz, the rotations that map a cube to itself.

@@ -86,7 +86,7 @@ def actors_table(actors: Path) -> str:
     """Return a Markdown table of the evaluated actors in a folder.
 
     Raises:
-        ValueError: If a file is no evaluation of an actor; the line names it.
+        ValueError: If a file is no evaluation of an actor; the message names the file.
     """
     head = (
         '| task | success (95 % interval) | at most | in Gymnasium-Robotics | touched once '
@@ -99,7 +99,7 @@ def actors_summary(actors: Path) -> str:
     """Return `actors_table` in five short columns, without sources.
 
     Raises:
-        ValueError: If a file is no evaluation of an actor; the line names it.
+        ValueError: If a file is no evaluation of an actor; the message names the file.
     """
     head = '| task | success | 95 % interval | in Gymnasium-Robotics | best published |'
     return _table(head, actors, _short_row)
