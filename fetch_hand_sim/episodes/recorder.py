@@ -32,6 +32,7 @@ from fetch_hand_sim.episode_log import (
     episode_metadata,
 )
 from fetch_hand_sim.simulation import Simulation
+from fetch_hand_sim.simulation.models import compiled_bytes
 from msgs_spec.tick import EpisodeStatus, Tick
 from msgs_spec.topics import TopicSpec
 from node_runtime.source_revision import source_revision
@@ -361,13 +362,6 @@ def episode_result(status: EpisodeStatus, late_commands: int | None = None) -> d
 # Fields of a compiled model that depend on the place of its files, and fields that no file keeps.
 _OF_PATHS = {'paths', 'npaths', 'hfield_pathadr', 'mesh_pathadr', 'skin_pathadr', 'tex_pathadr'}
 _LEFT_OUT = frozenset({*_OF_PATHS, 'nbuffer', 'signature'})
-
-
-def compiled_bytes(model: mujoco.MjModel) -> bytes:
-    """Return the model as MuJoCo's binary format MJB, which only the same MuJoCo version reads."""
-    buffer = np.empty(mujoco.mj_sizeModel(model), dtype=np.uint8)
-    mujoco.mj_saveModel(model, None, buffer)
-    return buffer.tobytes()
 
 
 def model_sha256(model: mujoco.MjModel) -> str:

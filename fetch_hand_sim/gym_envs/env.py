@@ -14,6 +14,7 @@ from fetch_hand_sim.gym_envs.pictures import RENDER_MODES, Image
 from fetch_hand_sim.gym_envs.task_attributes import TaskAttributes, clip_actions
 from fetch_hand_sim.simulation import Observation, Simulation
 from fetch_hand_sim.simulation.arguments import finite_numbers
+from fetch_hand_sim.simulation.models import compiled_bytes
 from msgs_spec.arrays import Array
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ
 
@@ -241,7 +242,7 @@ class SharedPhysics:
     def model(self) -> mujoco.MjModel:
         """The compiled model, always the same object."""
         if not self._shares_model and self._simulation.varies_physics:
-            self._unchanged = _saved(self._simulation.model)
+            self._unchanged = compiled_bytes(self._simulation.model)
         self._shares_model = True
         return self._simulation.model
 
@@ -268,12 +269,12 @@ class SharedPhysics:
         is_unchanged = self._is_unchanged()
         self._simulation.model.site_pos[sites] = positions
         if is_unchanged:
-            self._unchanged = _saved(self._simulation.model)
+            self._unchanged = compiled_bytes(self._simulation.model)
 
     def _is_unchanged(self) -> bool:
         if self._unchanged is None or not self._simulation.varies_physics:
             return False
-        return self._unchanged == _saved(self._simulation.model)
+        return self._unchanged == compiled_bytes(self._simulation.model)
 
     def send(self) -> None:
         """Copy changes of `model` and `data` to the simulation, before a computation."""
@@ -290,10 +291,3 @@ class SharedPhysics:
     def __getstate__(self) -> dict[str, Any]:
         """Return the state for `pickle` without `data`, which is read from the simulation again."""
         return self.__dict__ | {'_data': None}
-
-
-def _saved(model: mujoco.MjModel) -> bytes:
-    """Return a model in the binary format MJB."""
-    buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
-    mujoco.mj_saveModel(model, None, buffer)
-    return buffer.tobytes()

@@ -72,6 +72,13 @@ def load_model(relative: str) -> mujoco.MjModel:
     return load_spec(relative).compile()
 
 
+def compiled_bytes(model: mujoco.MjModel) -> bytes:
+    """Return the model as MuJoCo's binary format MJB, which only the same MuJoCo version reads."""
+    buffer = np.empty(mujoco.mj_sizeModel(model), dtype=np.uint8)
+    mujoco.mj_saveModel(model, None, buffer)
+    return buffer.tobytes()
+
+
 def find(model: mujoco.MjModel, kind: Any, name: str) -> int:
     """Return the number of an element, such as a body (`mjOBJ_BODY`), or -1 if it is missing."""
     return int(mujoco.mj_name2id(model, kind.value, name))

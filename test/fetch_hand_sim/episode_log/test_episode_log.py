@@ -27,11 +27,10 @@ from fetch_hand_sim.episode_log import (
 from fetch_hand_sim.episode_log.bag import CHUNK_BYTES, offered_qos_text
 from fetch_hand_sim.episodes.recorder import (
     compiled_attachment,
-    compiled_bytes,
     mjcf_attachment,
     model_sha256,
 )
-from fetch_hand_sim.simulation.models import asset_path
+from fetch_hand_sim.simulation.models import asset_path, compiled_bytes
 from msgs_spec.codecs import decode
 from msgs_spec.schemas import deserialize, schema_text, type_hash
 from msgs_spec.topics import LATCHED, topics
