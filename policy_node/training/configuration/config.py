@@ -9,6 +9,7 @@ from __future__ import annotations
 import ast
 import inspect
 import math
+import sys
 import typing
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -416,9 +417,11 @@ class Field:
 def _describe() -> Iterator[Field]:
     """Yield all fields in the order of the groups; titles and meanings are read from the source."""
     hints = typing.get_type_hints(TrainConfig, include_extras=True)
+    # The whole module is parsed once: for the source of one class, Python parses all of it.
+    source = ast.parse(inspect.getsource(sys.modules[__name__]))
+    classes = {each.name: each for each in source.body if isinstance(each, ast.ClassDef)}
     for group in reversed(TrainConfig.__mro__[1:-1]):
-        (tree,) = ast.parse(inspect.getsource(group)).body
-        assert isinstance(tree, ast.ClassDef)
+        tree = classes[group.__name__]
         title = (ast.get_docstring(tree) or '').splitlines()[0].rstrip('.')
         for pair in pairwise(tree.body):
             match pair:
