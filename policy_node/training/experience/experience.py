@@ -147,12 +147,13 @@ class Experience:
         del env_steps
         return self._draw(self.mixture())
 
-    def _draw(self, mixture: dict[str, float]) -> Transitions:
-        replay = self.replay
+    def _draw(
+        self, mixture: dict[str, float], sampler: TransitionSampler | None = None
+    ) -> Transitions:
+        """Draw a batch, with another sampler than the experience's own if one is given."""
+        chosen, replay = sampler or self._sampler, self.replay
         row = self._draw_rows()
-        return self._sampler.sample(
-            replay.episodes, row, mixture, self.generator, replay.valid_ticks
-        )
+        return chosen.sample(replay.episodes, row, mixture, self.generator, replay.valid_ticks)
 
     def _draw_rows(self) -> NDArray[np.int64]:
         """Draw an episode for each transition of a batch; return rows of the replay, (batch,)."""

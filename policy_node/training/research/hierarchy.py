@@ -247,7 +247,6 @@ class HierarchicalExperience(Experience):
         del env_steps
         config, mixture = self.config, self.mixture()
         low = self._draw(with_subgoals(mixture))
-        rows = self._draw_rows()
         subgoals = SubgoalSampler(
             compute_reward=self._sampler.compute_reward,
             gamma=self._sampler.gamma,
@@ -255,7 +254,7 @@ class HierarchicalExperience(Experience):
             reward_scale=self._sampler.reward_scale,
             missed_value=config.lowest_value,
         )
-        high = subgoals.sample(self.replay.episodes, rows, mixture, self.generator)
+        high = self._draw(mixture, subgoals)
         values = {name: getattr(low, name) for name in Transitions.__slots__}
         values['action'] = low.action[:, : self._spec.robot.action_size]
         return HierarchicalTransitions(**values, high=high)

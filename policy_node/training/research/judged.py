@@ -150,6 +150,7 @@ class JudgedExperience(Experience):
         super().narrow(progress)
         self.judged = self.judged.at(progress)
 
-    def _draw(self, mixture: dict[str, float]) -> Transitions:
-        replay, row = self.replay, self._draw_rows()
-        return self.judged.sample(replay.episodes, row, mixture, self.generator, replay.valid_ticks)
+    def batch(self, env_steps: int) -> Transitions:
+        """Draw the transitions for one update from `judged`."""
+        del env_steps
+        return self._draw(self.mixture(), self.judged)
