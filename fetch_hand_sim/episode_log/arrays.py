@@ -105,10 +105,10 @@ def _decode(file: Episode) -> EpisodeArrays:
     # A cut-off episode may contain a part of its last tick.
     ticks = min(file.count(name) for name in (*names, 'is_success'))
     ticks = min(ticks, 1 + file.count('applied_command'))
-    stamps, _ = _codec(task, names[0]).decode_many(file.rows(names[0])[1][:ticks])
+    stamps, first = _codec(task, names[0]).decode_many(file.rows(names[0])[1][:ticks])
     if not (np.diff(stamps) > 0).all():
         raise ValueError('stamps do not grow')
-    vectors = {name: stamped_vectors(file, task, name, stamps) for name in names}
+    others = {name: stamped_vectors(file, task, name, stamps) for name in names[1:]}
     rewards = _unstamped_vectors(file, task, 'reward', stamps, first=1)[:, 0]
     commands = _unstamped_vectors(file, task, 'applied_command', stamps, first=1)
     steps = ticks - 1
@@ -118,7 +118,7 @@ def _decode(file: Episode) -> EpisodeArrays:
     return EpisodeArrays(
         path=file.path,
         spec=record.spec,
-        observations=assembler.assemble(vectors),
+        observations=assembler.assemble({names[0]: first, **others}),
         actions=action_from_command(task.robot, commands),
         commands=commands,
         rewards=rewards,
