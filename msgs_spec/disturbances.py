@@ -32,6 +32,7 @@ class Kind:
         off: The number that disturbs nothing.
         is_range: Whether a value is a pair (lowest, highest) from which each episode draws; one
             number n stands for (n, n).
+        is_factor: Whether a number multiplies, so that it is scaled and drawn on a log scale.
     """
 
     off: float
@@ -39,6 +40,7 @@ class Kind:
     highest: float
     is_range: bool = True
     is_whole: bool = False
+    is_factor: bool = False
 
     def checked(self, name: str, value: Any) -> Any:
         """Return a value in its form, or raise ValueError with the allowed range."""
@@ -65,21 +67,21 @@ class Kind:
             return tuple(self.scaled(each, strength) for each in value)
         change = strength * (value - self.off)
         moved = self.off + (round(change) if self.is_whole else change)
-        return min(max(value**strength if self is FACTOR else moved, self.lowest), self.highest)
+        return min(max(value**strength if self.is_factor else moved, self.lowest), self.highest)
 
     def drawn(self, span: Span, share: float) -> float:
         """Return the number of a range that is `share` of the way through it."""
         lowest, highest = span
         if self.is_whole:
             return float(lowest + int(share * (highest - lowest + 1)))
-        if self is FACTOR:
+        if self.is_factor:
             return float(lowest * (highest / lowest) ** share)
         return float(lowest + share * (highest - lowest))
 
 
 SIZE = Kind(0.0, 0.0, 100.0, is_range=False)
 PROBABILITY = Kind(0.0, 0.0, 1.0, is_range=False)
-FACTOR = Kind(1.0, 0.05, 20.0)
+FACTOR = Kind(1.0, 0.05, 20.0, is_factor=True)
 TICKS = Kind(0, 0, MOST_TICKS, is_whole=True)
 PERIOD = Kind(1, 1, 100, is_whole=True)
 SHIFT = Kind(0.0, -1.0, 1.0)
