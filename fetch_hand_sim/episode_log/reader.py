@@ -302,7 +302,7 @@ def logged_topics(episode: Episode) -> dict[str, TopicSpec]:
 
 
 def split_ticks(episode: Episode) -> list[LoggedTick]:
-    """Divide an episode into its ticks, each of which begins with `/clock`.
+    """Divide an episode into its ticks. The first message of a tick is `/clock`.
 
     Raises:
         EpisodeReadError: If the messages are not in this order.

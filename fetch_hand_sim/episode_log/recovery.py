@@ -208,7 +208,7 @@ def _remove_empty(leftover: Path) -> None:
 
 @dataclass(slots=True)
 class _Remains:
-    """What can be read of a cut-off file.
+    """The readable part of a cut-off file.
 
     Attributes:
         contents: Records up to the first damage.

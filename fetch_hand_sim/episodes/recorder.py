@@ -63,7 +63,7 @@ DIVERGED = 'diverged'
 
 
 class RecordingContext:
-    """What all episode files of one simulation share: attachments and most metadata.
+    """Makes the attachments and the metadata for the episode files of one simulation.
 
     Every episode contains the MJCF text; `with_compiled_model` adds the compiled model, 3 MB. The
     largest force of a push, `perturb_limit`, is in N.

@@ -1,4 +1,4 @@
-"""What the single and the vector environment share: arguments, spaces, settings."""
+"""Common parts of the single and the vector environment: arguments, spaces, settings."""
 
 from __future__ import annotations
 

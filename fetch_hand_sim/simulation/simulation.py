@@ -194,7 +194,7 @@ class Simulation:
     def read_data(self, index: int, data: Any) -> None:
         """Copy the state of simulation `index` into a `mujoco.MjData`.
 
-        What MuJoCo derives from the state, such as contacts, is copied only with `keeps_data`.
+        Values that MuJoCo derives from the state, such as contacts, are copied with `keeps_data`.
 
         Goals, random generators and divergence counters are not included, as in `write_data`.
         """

@@ -20,7 +20,7 @@ _TOLERANCE = 1e-9
 # Offset between two rows of readings, so that formulas cannot mix them up unnoticed.
 _OFFSET = 1e-6
 _STEPS = 3
-# Each rule yields whether it is met, and the problem otherwise. Later rules rely on earlier ones.
+# Each rule yields a condition, and the error if it is False. Later rules rely on earlier ones.
 Rules = Iterator[tuple[Any, str]]
 
 

@@ -53,7 +53,7 @@ _ROLE, _READ_ONLY_ROLE = b'\0Controlling\0', b'\0Watching\0\0\0\0'
 
 
 class Attendance:
-    """Records whether somebody uses the page that controls the robot; safe for any thread.
+    """Records whether the page that controls the robot is in use; safe for any thread.
 
     Args:
         clock: A steady clock, seconds.
@@ -79,7 +79,7 @@ class Attendance:
         self._visits += 1
 
     def has_left(self) -> bool:
-        """Return whether nobody is at the page, or somebody has left it since the last call."""
+        """Return whether the page is not in use, or was closed since the last call."""
         visits, before = self._visits, self._known_visits
         self._known_visits = visits
         return visits != before or not self.is_there

@@ -79,9 +79,9 @@ def _run(options: argparse.Namespace, stop: StopSignals) -> None:
 
 
 def attended(robot: LiveRobot, attendance: Attendance) -> Perform:
-    """Return a function that passes requests to a robot only while somebody uses the page.
+    """Return a function that passes requests to a robot only while the page is in use.
 
-    A page that nobody uses is still drawn, and would repeat the request of a held button.
+    An unused page is still drawn, and would repeat the request of a held button.
     """
 
     def perform(request: Request) -> None:

@@ -146,7 +146,7 @@ class Player:
             self._notice = str(error)
 
     def _open_first(self, numbers: Sequence[int]) -> None:
-        """Open the first readable episode of these; EpisodeReadError if there is none."""
+        """Open the first readable episode of these, or raise EpisodeReadError."""
         skipped: list[EpisodeReadError] = []
         for number in numbers:
             try:

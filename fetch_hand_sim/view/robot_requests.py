@@ -124,7 +124,7 @@ class RemoteNode:
     def _awaits(self, name: str) -> bool:
         """Return whether request `name` still waits for its answer, so that none is sent again.
 
-        A request without an answer is given up after a few seconds.
+        After a few seconds without an answer it no longer waits.
         """
         future, asked = self._asked.get(name, (None, 0.0))
         is_recent = time.monotonic() - asked < _ANSWER_TIMEOUT

@@ -39,7 +39,7 @@ def fingertip_sites(model: mujoco.MjModel) -> NDArray[np.intp]:
 
 
 class HandTask(Task):
-    """What HandReach and the manipulation tasks share: actions, resting commands, fingertips."""
+    """Base of HandReach and the manipulation tasks: actions, resting commands, fingertips."""
 
     def __init__(self, spec: TaskSpec, model: mujoco.MjModel, batch: BatchConfig) -> None:
         super().__init__(spec, model, batch)

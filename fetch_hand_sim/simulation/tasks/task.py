@@ -297,7 +297,7 @@ class Task(ABC):
     def read_data(self, index: int, data: mujoco.MjData) -> None:
         """Copy the state of simulation `index` into `data`.
 
-        What MuJoCo derives from the state, such as contacts, is copied only with `keeps_data`.
+        Values that MuJoCo derives from the state, such as contacts, are copied with `keeps_data`.
         """
         self.batch.get_data(index, data)
         # The `MjData` of a copy that has not stepped yet is newer than the task's outputs.

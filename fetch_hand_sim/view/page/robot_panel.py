@@ -37,7 +37,7 @@ _INTRODUCTIONS = {
 
 
 def introduction(spec: TaskSpec) -> str:
-    """Return one line that says what the robot should do in a task."""
+    """Return one line about the goal of a task."""
     text = _INTRODUCTIONS.get(spec.name)
     things = (word for word in ('Block', 'Egg', 'Pen') if f'HandManipulate{word}' in spec.name)
     if spec.formulas is None and (thing := next(things, '').lower()):

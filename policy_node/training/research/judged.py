@@ -59,7 +59,7 @@ class ChoosingSampler(TransitionSampler):
     """Relabels with the future goal, of several drawn, from which the critic learns most.
 
     Attributes:
-        judge: The learner whose critic or actor is asked.
+        judge: The learner; its critic or actor judges.
         choice: `bellman` (largest error of the value) or `uncertain` (largest difference between
             critics).
     """
@@ -110,7 +110,7 @@ class CuttingSampler(TransitionSampler):
     """Returns that end before an action far from the actor's.
 
     Attributes:
-        judge: The learner whose critic or actor is asked.
+        judge: The learner; its critic or actor judges.
         cut_distance: Largest distance from the actor's action, root mean square.
     """
 
@@ -137,7 +137,7 @@ class CuttingSampler(TransitionSampler):
 
 
 class JudgedExperience(Experience):
-    """Batches from a sampler that asks the learner. Statistics are collected without it.
+    """Batches from a sampler that depends on the learner. Statistics are collected without it.
 
     Attributes:
         judged: The sampler of the batches.
