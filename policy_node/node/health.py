@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
 
 from msgs_spec.tick import EpisodeStatus
-from node_runtime.diagnostics import ASKED_RATE, MODE, PAUSED, RATE, Report
+from node_runtime.diagnostics import ASKED_RATE, MODE, PAUSED, RATE, Increase, Report
 from node_runtime.ros import MEMORY_OF_THE_GRAPH
 from policy_node.node.responder import Responder
 
@@ -61,8 +62,7 @@ class Health:
         self._name = name
         self._responder: Responder | None = None
         self._tick_duration = 0.0
-        # Counters of the last report.
-        self._before: dict[str, int] = {}
+        self._increases: defaultdict[str, Increase] = defaultdict(Increase)
         self._then = 0.0
         # Last time without a second robot and without a second publisher of a topic.
         self._alone_at = -math.inf
@@ -72,7 +72,7 @@ class Health:
         """Begin to report on a robot; `now` is in seconds of the responder's clock."""
         self._responder, self._then = responder, now
         self._tick_duration = 1.0 / status.control_hz
-        self._before = {}
+        self._increases.clear()
 
     def stop(self) -> None:
         """Wait for a robot again."""
@@ -128,8 +128,7 @@ class Health:
         """Return the growth of the counters since the last report."""
         counters = {name: getattr(responder, name) for name in _COUNTERS}
         counters['dropped'] = responder.join.dropped
-        before, self._before = self._before, counters
-        return {name: count - before.get(name, 0) for name, count in counters.items()}
+        return {name: round(self._increases[name].since(n)) for name, n in counters.items()}
 
     def news(self, report: Report) -> list[str]:
         """Return the problems of `report` that the report before did not have.
