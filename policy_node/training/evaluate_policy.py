@@ -7,22 +7,26 @@ import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from fetch_hand_sim.simulation import Simulation
 from msgs_spec.parameters import LARGEST_SEED
 from node_runtime.command_line import (
     EXIT_SUCCESS,
     CommandParser,
+    UsageError,
     progress,
     run_command,
     whole_number,
 )
 from node_runtime.signals import EXIT_INTERRUPTED
 from policy_node.policies.files import to_csv, to_json
-from policy_node.policies.policy import Policy
+from policy_node.policies.loading import load_policy
+from policy_node.policies.policy import LoadedPolicy
 from policy_node.training.evaluation import (
     FIRST_SEED,
     EpisodeOutcomes,
+    compare,
     evaluate,
     print_table,
     summarize,
@@ -58,6 +62,8 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
         help='write the summary to a file, or print it instead of the table',
     )
     add('--csv', type=Path, help='write one row per episode')
+    other = 'another policy (as --policy), compared on the same episodes: difference of success'
+    add('--against', metavar='POLICY', help=other)
     return parser.parse_args(arguments)
 
 
@@ -70,11 +76,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _run(options: argparse.Namespace) -> int:
     loaded = load_chosen_policy(options)
     simulation = make_chosen_simulation(options, loaded)
+    other = _load_other(options, loaded.task, simulation.control_hz)
     for file in (options.json, options.csv):
         if file not in (None, _STDOUT):
             require_writable(file)
     with policy_errors():
-        outcomes, code = _evaluate(options, simulation, replace(loaded, is_bounded=True))
+        outcomes, code = _evaluate(options, simulation, loaded)
     report = {
         'policy': options.policy or loaded.task,
         'task': loaded.task,
@@ -86,6 +93,23 @@ def _run(options: argparse.Namespace) -> int:
     if not simulation.disturbances.is_off:
         report['disturbances'] = simulation.disturbances.as_dict()
     try:
+        if other is not None and code == EXIT_SUCCESS:
+            with policy_errors():
+                others, code = _evaluate(options, simulation, other)
+            report['against'] = {
+                'policy': options.against,
+                'sha256': other.sha256,
+                **summarize(others),
+                **compare(outcomes, others, options.success_rule),
+            }
+    finally:
+        # Also if the other policy failed.
+        _write(options, report, outcomes)
+    return code
+
+
+def _write(options: argparse.Namespace, report: dict[str, Any], outcomes: EpisodeOutcomes) -> None:
+    try:
         if options.json == _STDOUT:
             print(to_json(report).decode(), end='', flush=True)
         else:
@@ -96,11 +120,26 @@ def _run(options: argparse.Namespace) -> int:
             write_result(options.json, to_json(report))
         if options.csv is not None:
             write_result(options.csv, _to_csv(outcomes))
-    return code
+
+
+def _load_other(options: argparse.Namespace, task: str, control_hz: float) -> LoadedPolicy | None:
+    """Return the policy of `--against`, or None.
+
+    Raises:
+        UsageError: If it cannot be loaded or acts at another frequency than `control_hz`.
+    """
+    if options.against is None:
+        return None
+    try:
+        other = load_policy(options.against, task, trust=options.trust)
+        other.require_rate(control_hz)
+    except ValueError as error:
+        raise UsageError(f'--against: {error}') from None
+    return other
 
 
 def _evaluate(
-    options: argparse.Namespace, simulation: Simulation, policy: Policy
+    options: argparse.Namespace, simulation: Simulation, policy: LoadedPolicy
 ) -> tuple[EpisodeOutcomes, int]:
     """Evaluate the policy; return the outcomes and the exit code of the command.
 
@@ -119,7 +158,8 @@ def _evaluate(
 
         try:
             episodes, first_seed = options.episodes, options.first_seed
-            return evaluate(simulation, policy, episodes, first_seed, note), EXIT_SUCCESS
+            bounded = replace(policy, is_bounded=True)
+            return evaluate(simulation, bounded, episodes, first_seed, note), EXIT_SUCCESS
         except KeyboardInterrupt:
             if not finished:
                 raise

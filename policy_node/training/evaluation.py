@@ -87,6 +87,37 @@ def wilson_interval(successes: int, episodes: int) -> tuple[float, float]:
     return max(0.0, (centre - spread) / scale), min(1.0, (centre + spread) / scale)
 
 
+def compare(
+    first: EpisodeOutcomes, second: EpisodeOutcomes, success_rule: str = 'gymnasium'
+) -> dict[str, Any]:
+    """Compare the success of two policies on the same episodes, ready for JSON.
+
+    Args:
+        first: Outcomes of one policy.
+        second: Outcomes of the other; compared are the episodes that both have.
+        success_rule: `gymnasium` or `paper`.
+
+    Returns:
+        `episodes`: number of compared episodes. `difference`: success rate of the first minus that
+        of the second. `difference_interval_95`: its interval for pairs (Agresti and Min 2005, which
+        adds half an episode to each of the four outcomes). `only_first`, `only_second`: number of
+        episodes in which only one succeeds.
+    """
+    count = min(len(first), len(second))
+    one, two = (getattr(each, f'success_{success_rule}')[:count] for each in (first, second))
+    only_first, only_second = int((one & ~two).sum()), int((two & ~one).sum())
+    gap, size = only_first - only_second, count + 2
+    spread = _Z95 * math.sqrt(only_first + only_second + 1 - gap**2 / size) / size
+    interval = [max(-1.0, gap / size - spread), min(1.0, gap / size + spread)]
+    return {
+        'episodes': count,
+        'difference': gap / count,
+        'difference_interval_95': interval,
+        'only_first': only_first,
+        'only_second': only_second,
+    }
+
+
 def summarize(outcomes: EpisodeOutcomes) -> dict[str, Any]:
     """Return success rates with 95 % intervals, mean return and `diagnose`, ready for JSON."""
     episodes = len(outcomes)
@@ -237,7 +268,7 @@ def print_table(report: dict[str, Any]) -> None:
     """Print the summary of an evaluation as a table, with 95 % intervals.
 
     `report` is the result of `summarize` with the keys `task` and `policy`, and maybe
-    `disturbances`.
+    `disturbances` and `against` (the report of another policy with the result of `compare`).
     """
     title = f'{report["task"]}: {report["policy"]}, {report["episodes"]} episodes'
     if 'disturbances' in report:
@@ -256,5 +287,17 @@ def print_table(report: dict[str, Any]) -> None:
             table.add_row(label, f'{report[name]:.4f}', '')
     table.add_row('mean return', f'{report["mean_return"]:.3f}', '')
     table.add_row('diverged episodes', str(report['diverged']), '')
+    if 'against' in report:
+        _add_comparison(table, report['against'])
     # Numbers are whole in a terminal that has no room for them.
     Console(width=max(Console().width, _NARROWEST)).print(table)
+
+
+def _add_comparison(table: Table, other: dict[str, Any]) -> None:
+    low, high = other['difference_interval_95']
+    table.add_section()
+    label = Text(f'success minus that of {other["policy"]}')
+    table.add_row(label, f'{other["difference"]:+.4f}', f'{low:+.4f} ... {high:+.4f}')
+    table.add_row('compared episodes', str(other['episodes']), '')
+    table.add_row('only this policy succeeds', str(other['only_first']), '')
+    table.add_row('only the other succeeds', str(other['only_second']), '')

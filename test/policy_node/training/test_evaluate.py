@@ -16,6 +16,7 @@ from policy_node.policies.policy import RandomPolicy, RestingPolicy
 from policy_node.training.evaluate_policy import main
 from policy_node.training.evaluation import (
     EpisodeOutcomes,
+    compare,
     diagnose,
     evaluate,
     run_episodes,
@@ -173,6 +174,56 @@ def test_command_line_writes_table_json_and_csv(tmp_path, capsys):
     assert 'gymnasium rule' in capsys.readouterr().out
 
 
+def outcomes_of(success):
+    """Outcomes of as many episodes; only the success by the released code's rule varies."""
+    zeros = {name: np.zeros(len(success)) for name in EpisodeOutcomes.__slots__}
+    return EpisodeOutcomes(**zeros | {'success_gymnasium': np.array(success)})
+
+
+@pytest.mark.parametrize(('episodes', 'good', 'bad'), [(50, 0.95, 0.8), (400, 0.3, 0.28)])
+def test_the_interval_of_a_difference_holds_it_in_95_of_100_cases(episodes, good, bad):
+    """Half of the episodes are equally difficult for both policies, so successes correlate."""
+    random = np.random.default_rng(1)
+    found = []
+    for _ in range(1000):
+        difficulty = random.random((2, episodes))
+        difficulty[1, ::2] = difficulty[0, ::2]
+        one, two = difficulty[0] < good, difficulty[1] < bad
+        low, high = compare(outcomes_of(one), outcomes_of(two))['difference_interval_95']
+        found.append(low <= good - bad <= high)
+    assert 0.93 <= np.mean(found) <= 0.99
+
+
+def test_two_policies_are_compared_on_the_same_episodes(tmp_path, capsys):
+    json_file = tmp_path / 'e.json'
+    arguments = ['--policy', 'FetchReach', '--against', 'resting', '--episodes', '16']
+    assert main([*arguments, '--threads', '1', '--json', str(json_file)]) == 0
+    report = json.loads(json_file.read_text())
+    other = report['against']
+    resting = evaluate(simulation(16), RestingPolicy(4), 16, report['first_seed'])
+    assert other['success_gymnasium'] == resting.success_gymnasium.mean()
+    assert other['only_first'] == 16 - resting.success_gymnasium.sum()
+    assert (other['policy'], other['episodes'], other['only_second']) == ('resting', 16, 0)
+    low, high = other['difference_interval_95']
+    assert 0.5 < low < other['difference'] == other['only_first'] / 16 <= high <= 1.0
+    assert 'success minus that of resting' in capsys.readouterr().out
+
+
+def test_the_first_policy_is_reported_although_the_second_fails(tmp_path, monkeypatch, capsys):
+    (tmp_path / 'broken.py').write_text(
+        'from itertools import count\n'
+        'def make(task):\n'
+        '    calls = count()\n'
+        '    return lambda observation: [0.0 if next(calls) < 30 else float("nan")] * 4\n'
+    )
+    monkeypatch.chdir(tmp_path)
+    arguments = ['--policy', 'resting', '--task', 'FetchReach', '--against', 'broken:make']
+    assert main([*arguments, '--trust', '--episodes', '2', '--json', 'e.json']) == 1
+    report = json.loads((tmp_path / 'e.json').read_text())
+    assert report['episodes'] == 2 and 'against' not in report
+    assert 'broken:make' in capsys.readouterr().err
+
+
 def test_an_actor_is_evaluated_at_the_rate_it_was_trained_at(tmp_path):
     fresh_actor(tmp_path / 'fast.safetensors', 'FetchReach', control_hz=250.0)
     policy, json_file = str(tmp_path / 'fast.safetensors'), tmp_path / 'report.json'
@@ -192,6 +243,7 @@ def test_an_actor_is_evaluated_at_the_rate_it_was_trained_at(tmp_path):
         # Before the episodes.
         (['--policy', 'FetchReach', '--json', '/dev/null/a.json'], 'a.json cannot be written'),
         (['--policy', 'FetchReach', '--csv', '/dev'], '/dev cannot be written'),
+        (['--policy', 'FetchReach', '--against', 'FetchPush'], '--against: '),
     ],
 )
 def test_bad_usage_is_one_line_and_exit_status_2(arguments, message, capsys):
