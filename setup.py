@@ -38,6 +38,7 @@ TEST = [
     'colcon-package-selection',
     'colcon-python-setup-py',
     'colcon-ros',
+    'grimp',
     'import-linter',
     'mcap-ros2-support',
     'pytest',

@@ -11,11 +11,11 @@ from email.parser import Parser
 from importlib.metadata import packages_distributions
 from pathlib import Path
 
+import grimp
 import pytest
 import yaml
 from catkin_pkg.package import parse_package
 from test_colcon_install import PYTHON_PACKAGES, tracked_files
-from test_layers import ROS, SOURCES, imports
 
 from support import ROOT
 
@@ -28,6 +28,20 @@ NOT_IN_SDIST = (
     '.dockerignore',
     'Dockerfile',
 )
+
+ROS = {
+    'rclpy',
+    'rcl_interfaces',
+    'builtin_interfaces',
+    'diagnostic_msgs',
+    'geometry_msgs',
+    'rosgraph_msgs',
+    'sensor_msgs',
+    'std_msgs',
+    'std_srvs',
+    'tf2_msgs',
+    'visualization_msgs',
+}
 
 
 @pytest.fixture(scope='module')
@@ -93,8 +107,8 @@ def test_the_metadata_are_complete_and_the_base_installation_is_small(metadata) 
 
 def imported_packages() -> set[str]:
     """Top-level names of what the sources import, wherever in them."""
-    found = (each for path in SOURCES for each in imports(path.read_text(), ''))
-    return {each.module.partition('.')[0] for each in found}
+    graph = grimp.build_graph(*PYTHON_PACKAGES, include_external_packages=True, cache_dir=None)
+    return {name.partition('.')[0] for name in graph.modules}
 
 
 def test_everything_that_is_imported_is_required(metadata) -> None:
@@ -113,7 +127,7 @@ def test_everything_that_is_imported_is_required(metadata) -> None:
 
 def test_package_xml_names_every_ros_package_that_is_imported() -> None:
     depends = {each.name for each in parse_package(ROOT / 'package.xml').build_depends}
-    assert imported_packages() & set(ROS) <= depends
+    assert imported_packages() & ROS <= depends
 
 
 def test_all_versions_are_one(metadata) -> None:
