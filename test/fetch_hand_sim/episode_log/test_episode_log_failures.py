@@ -12,9 +12,6 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from mcap.exceptions import EndOfFile
-from mcap.records import Message
-from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 from rosbags.highlevel import AnyReader
 
@@ -44,7 +41,6 @@ LOG = 'fetch_hand_sim.episode_log'
 
 RECORDER_SCRIPT = SUPPORT / 'episode_recorder.py'
 NOBODY = 65534
-TICK_NS = 40_000_000
 
 
 @pytest.fixture(scope='module')
@@ -82,15 +78,6 @@ def killed(tmp_path_factory):
     return directory, running
 
 
-def test_a_killed_recorder_leaves_finished_episodes_intact(killed):
-    directory, _ = killed
-    for name in ('FetchReach_000000_seed0', 'FetchReach_000001_seed1'):
-        assert read_episode(directory / name).is_complete
-        with AnyReader([directory / name]) as reader:
-            for connection, _, data in reader.messages():
-                reader.deserialize(data, connection.msgtype)
-
-
 def test_a_killed_recorder_leaves_an_episode_marked_as_unfinished(killed):
     directory, running = killed
     assert running == [], 'an episode that is being written is no leftover'
@@ -101,26 +88,13 @@ def test_a_killed_recorder_leaves_an_episode_marked_as_unfinished(killed):
     assert 0 <= leftover.age_s < 120
     assert 'FetchReach_000002_seed2' in str(leftover)
     assert not (directory / leftover.name).exists()
+    assert all(read_episode(path).is_complete for path in find_episodes(directory))
+    assert len(find_episodes(directory)) == 2
     for read in (read_episode, read_summary, load_episodes):
         with pytest.raises(EpisodeReadError, match='truncated by a kill') as caught:
             read(leftover.path)
         assert f'`fetch_hand_sim episodes recover {directory}`' in str(caught.value)
         assert_one_line(caught.value)
-
-
-def test_a_kill_loses_at_most_half_a_simulated_second(killed):
-    directory, _ = killed
-    times = []
-    with pytest.raises(EndOfFile):
-        with (directory / '.FetchReach_000002_seed2.active/FetchReach_000002_seed2_0.mcap').open(
-            'rb'
-        ) as stream:
-            for record in StreamReader(stream, validate_crcs=True).records:
-                if isinstance(record, Message):
-                    times.append(record.log_time)
-    # Two episodes of 51 ticks came before.
-    last_ns = 10**9 + (2 * 51 + 39) * TICK_NS
-    assert last_ns - 500_000_000 - TICK_NS <= times[-1] < last_ns
 
 
 def test_the_next_run_starts_after_the_killed_one(killed, recorder, tmp_path):
@@ -160,7 +134,7 @@ def test_recovery_makes_a_bag_of_what_reached_the_disk(killed, tmp_path):
         'success': 'false',
     }
     assert recovered.metadata == original.metadata
-    assert len(recovered.topics['/joint_states'].messages) > 25
+    assert len(recovered.topics['/joint_states'].messages) >= 27
     for name, topic in recovered.topics.items():
         expected = original.topics[name]
         assert topic.messages == expected.messages[: len(topic.messages)]
@@ -323,21 +297,17 @@ def test_an_error_of_the_disk_is_raised_once_and_stops_the_log(
     assert not (tmp_path / 'episode').exists()
 
 
-def test_an_error_at_the_end_never_shows_a_finished_episode(tmp_path, recorder, ticks, monkeypatch):
+@pytest.mark.parametrize(('size', 'left'), [(100, []), (4000, ['.episode.active'])])
+def test_an_error_at_the_begin_or_the_end_never_shows_a_finished_episode(
+    tmp_path, recorder, ticks, monkeypatch, size, left
+):
     monkeypatch.setattr(f'{LOG}.writer.FLUSH_PERIOD_NS', 10**12)
-    writer = EpisodeWriter(tmp_path, 'episode', {})
-    recorder.write(writer, ticks)
-    with files_at_most(4000), pytest.raises(EpisodeLogError, match='File too large') as caught:
+    with files_at_most(size), pytest.raises(EpisodeLogError, match='File too large') as caught:
+        writer = EpisodeWriter(tmp_path, 'episode', {'note': 'x' * 100} if not left else {})
+        recorder.write(writer, ticks)
         writer.finish({'success': 'true'})
     assert_one_line(caught.value)
-    assert [path.name for path in tmp_path.iterdir()] == ['.episode.active']
-
-
-def test_an_episode_that_cannot_be_begun_leaves_nothing(tmp_path, recorder):
-    with files_at_most(100), pytest.raises(EpisodeLogError, match='File too large') as caught:
-        EpisodeWriter(tmp_path, 'episode', recorder.metadata())
-    assert_one_line(caught.value)
-    assert list(tmp_path.iterdir()) == []
+    assert [path.name for path in tmp_path.iterdir()] == left
 
 
 def test_the_next_episode_is_logged_again(tmp_path, ticks):
@@ -346,27 +316,6 @@ def test_the_next_episode_is_logged_again(tmp_path, ticks):
     with files_at_most(4000), pytest.raises(EpisodeLogError):
         recorder.write(writer, ticks)
     assert recorder.record(directory).name == 'FetchReach_000001_seed0'
-
-
-def test_a_full_disk(mount, recorder, ticks, monkeypatch):
-    small_disk = mount('size=2m')
-    monkeypatch.setattr(f'{LOG}.writer.MINIMUM_FREE_BYTES', 1024 * 1024)
-    directory = EpisodeDirectory(small_disk)
-    writer = directory.begin('FetchReach', 0, {})
-    (small_disk / 'filler').write_bytes(bytes(2040 * 1024 - 16 * 1024))
-    with pytest.raises(EpisodeLogError, match='No space left on device') as caught:
-        recorder.write(writer, ticks)
-        writer.finish({})
-    assert_one_line(caught.value)
-    with pytest.raises(EpisodeLogError, match=r'MiB free on the disk, 1\.0 MiB wanted'):
-        directory.begin('FetchReach', 1, {})
-    (small_disk / 'filler').unlink()
-    writer = directory.begin('FetchReach', 1, {})
-    recorder.write(writer, ticks)
-    assert read_episode(writer.finish({})).is_complete
-    assert [leftover.name for leftover in find_leftovers(directory.path)] == [
-        'FetchReach_000000_seed0'
-    ]
 
 
 def test_too_little_free_space_is_noticed_before(tmp_path, monkeypatch):
@@ -410,26 +359,19 @@ def test_a_directory_that_is_a_file(tmp_path):
         EpisodeWriter(path, 'episode', {})
 
 
-def test_truncated_files_are_refused(finished, tmp_path):
+def test_truncated_files_and_flipped_bytes_are_refused(finished, tmp_path):
     whole = (finished / f'{finished.name}_0.mcap').read_bytes()
-    path = tmp_path / 'cut.mcap'
-    for size in [*range(0, 200, 7), *range(200, len(whole), 997), len(whole) - 1]:
-        path.write_bytes(whole[:size])
+    path = tmp_path / 'damaged.mcap'
+    sizes = [*range(0, 200, 7), *range(200, len(whole), 997), len(whole) - 1]
+    flipped = (
+        whole[:position] + bytes([whole[position] ^ 0xFF]) + whole[position + 1 :]
+        for position in range(0, len(whole), 397)
+    )
+    for data in (*(whole[:size] for size in sizes), *flipped):
+        path.write_bytes(data)
         with pytest.raises(EpisodeReadError) as caught:
             read_episode(path)
         assert str(path) in str(caught.value)
-        assert_one_line(caught.value)
-
-
-def test_no_flipped_byte_goes_unnoticed(finished, tmp_path):
-    whole = (finished / f'{finished.name}_0.mcap').read_bytes()
-    path = tmp_path / 'damaged.mcap'
-    for position in range(0, len(whole), 397):
-        damaged = bytearray(whole)
-        damaged[position] ^= 0xFF
-        path.write_bytes(damaged)
-        with pytest.raises(EpisodeReadError) as caught:
-            read_episode(path)
         assert_one_line(caught.value)
 
 

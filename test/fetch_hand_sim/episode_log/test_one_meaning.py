@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 from mcap.opcode import Opcode
-from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
+from mcap.writer import MCAP0_MAGIC, CompressionType
 
 from fetch_hand_sim.episode_log import (
     EpisodeDirectory,
@@ -223,123 +223,75 @@ def with_channels_in_the_summary(parts):
     return whole(parts.record, content, parts.result, summary=parts.channels)
 
 
-# Rows: name, reason of the rejection, function that makes the file.
+# Rows: reason of the rejection, function that makes the file.
 AMBIGUOUS = [
-    ('second channel', "2 channels of topic '/reward'", with_reward_of_two_channels),
-    ('redefined', 'channel 1 is defined twice', lambda p: p.file(chunk(channel(1, 1, '/zzz')))),
+    ("2 channels of topic '/reward'", with_reward_of_two_channels),
+    ('channel 1 is defined twice', lambda p: p.file(chunk(channel(1, 1, '/zzz')))),
+    ('channel 1 is defined twice', lambda p: p.file(summary=[channel(1, 1, '/zzz')])),
     (
-        'redefined in the summary',
-        'channel 1 is defined twice',
-        lambda p: p.file(summary=[channel(1, 1, '/zzz')]),
-    ),
-    (
-        'redefined schema',
         'schema 1 is defined twice',
         lambda p: p.file(chunk(schema(1, 'std_msgs/msg/Bool', 'bool data'))),
     ),
+    ('chunk record after the end of the data', lambda p: p.file(summary=[chunk(p.late_reward)])),
+    ('metadata record after the end of the data', lambda p: p.file(summary=[p.result])),
     (
-        'late chunk',
-        'chunk record after the end of the data',
-        lambda p: p.file(summary=[chunk(p.late_reward)]),
-    ),
-    (
-        'late metadata',
-        'metadata record after the end of the data',
-        lambda p: p.file(summary=[p.result]),
-    ),
-    (
-        'two results',
         "2 metadata records 'episode_result'",
         lambda p: p.file(metadata('episode_result', {'success': 'true', 'complete': 'true'})),
     ),
     (
-        'two episodes',
         "2 metadata records 'episode': a file of 2 episodes",
         lambda p: p.file(changed_record('episode', p.episode.metadata, {'seed': '1'})),
     ),
-    ('key', "key 'return' twice", a_key_twice),
-    ('decoy', 'index of the metadata disagrees', index_of_a_decoy),
-    ('chunk index', 'messages that the chunk indexes leave out', chunk_index_that_leaves_out),
-    ('message index', 'message indexes disagree', message_index_that_leaves_out),
-    ('chunk times', 'other times than its messages', lambda p: p.file(times=(5, 6))),
-    ('count', 'statistics disagree', lambda p: with_statistics(p, count=3)),
-    ('end', 'statistics disagree', lambda p: with_statistics(p, last=2 * p.last_ns)),
-    ('two statistics', 'two records of statistics', lambda p: with_statistics(p, records=2)),
+    ("key 'return' twice", a_key_twice),
+    ('index of the metadata disagrees', index_of_a_decoy),
+    ('messages that the chunk indexes leave out', chunk_index_that_leaves_out),
+    ('message indexes disagree', message_index_that_leaves_out),
+    ('other times than its messages', lambda p: p.file(times=(5, 6))),
+    ('statistics disagree', lambda p: with_statistics(p, count=3)),
+    ('statistics disagree', lambda p: with_statistics(p, last=2 * p.last_ns)),
+    ('two records of statistics', lambda p: with_statistics(p, records=2)),
+    ('two messages have the log time', lambda p: p.file(messages=[*p.messages, p.messages[-1]])),
     (
-        'equal times',
-        'two messages have the log time',
-        lambda p: p.file(messages=[*p.messages, p.messages[-1]]),
-    ),
-    (
-        'undefined channel',
         'channel 77, which is not defined',
         lambda p: p.file(messages=[*p.messages, message(77, p.last_ns + 1, b'')]),
     ),
+    ('another definition of', lambda p: with_schemas(p, lambda text: 'string evil')),
+    ('another definition of', lambda p: with_schemas(p, '# \x0c'.__add__)),
+    ("no topic '/reward' of type 'std_msgs/msg/Bool'", lambda p: p.with_reward_channel('Bool')),
+    ("'json'", lambda p: p.with_reward_channel(encoding='json')),
+    ('several namespaces', lambda p: p.with_reward_channel(topic='/left/reward')),
     (
-        'changed definition',
-        'another definition of',
-        lambda p: with_schemas(p, lambda text: 'string evil'),
-    ),
-    (
-        'definition hidden in a comment',
-        'another definition of',
-        lambda p: with_schemas(p, '# \x0c'.__add__),
-    ),
-    (
-        'other type',
-        "no topic '/reward' of type 'std_msgs/msg/Bool'",
-        lambda p: p.with_reward_channel('Bool'),
-    ),
-    ('other encoding', "'json'", lambda p: p.with_reward_channel(encoding='json')),
-    ('namespace', 'several namespaces', lambda p: p.with_reward_channel(topic='/left/reward')),
-    (
-        'longer schema',
         'a schema record is longer than its fields',
         lambda p: p.file(schemas=longer(Opcode.SCHEMA, p.schemas)),
     ),
     (
-        'longer channel',
         'a channel record is longer than its fields',
         lambda p: p.file(channels=longer(Opcode.CHANNEL, p.channels)),
     ),
-    ('longer result', 'a metadata record is longer than its fields', with_longer_result),
+    ('a metadata record is longer than its fields', with_longer_result),
+    ('a record of kind 12 in a chunk', lambda p: p.file(messages=[*p.messages, p.result])),
     (
-        'record in a chunk',
-        'a record of kind 12 in a chunk',
-        lambda p: p.file(messages=[*p.messages, p.result]),
-    ),
-    (
-        'message before its channel',
         'comes before the channel',
         lambda p: p.file(schemas=[*p.schemas, p.messages[0]], messages=p.messages[1:]),
     ),
-    ('late channels', 'comes before the channel', with_channels_in_the_summary),
+    ('comes before the channel', with_channels_in_the_summary),
+    ('comes before its schema', lambda p: p.file(schemas=p.channels, channels=p.schemas)),
     (
-        'channel before its schema',
-        'comes before its schema',
-        lambda p: p.file(schemas=p.channels, channels=p.schemas),
-    ),
-    (
-        'second header',
         'header record before the end of the data',
         lambda p: p.file(record(Opcode.HEADER, text('') + text(''))),
     ),
     (
-        'short message',
         'a message is shorter than its header',
         lambda p: p.file(messages=[record(Opcode.MESSAGE, struct.pack('<H', 1))]),
     ),
     (
-        'many records',
         'more than 16 metadata records',
         lambda p: p.file(*(metadata(f'record {number}', {}) for number in range(1000))),
     ),
 ]
 
 
-@pytest.mark.parametrize(
-    ('reason', 'make'), [each[1:] for each in AMBIGUOUS], ids=[each[0] for each in AMBIGUOUS]
-)
+@pytest.mark.parametrize(('reason', 'make'), AMBIGUOUS, ids=[each[0] for each in AMBIGUOUS])
 def test_an_ambiguous_file_is_rejected_by_all_readers(parts, tmp_path, reason, make):
     path = tmp_path / 'file.mcap'
     path.write_bytes(make(parts))
@@ -397,27 +349,11 @@ def test_a_file_of_one_meaning_is_read_sorted_by_time(parts, episodes, tmp_path,
 
 
 @pytest.mark.parametrize('compression', [CompressionType.NONE, CompressionType.LZ4])
-def test_files_without_chunks_and_of_all_compressions_are_read(
-    episodes, tmp_path, compression, monkeypatch
-):
+def test_files_of_all_compressions_are_read(episodes, tmp_path, compression, monkeypatch):
     recorder = Recorder('FetchReach')
     monkeypatch.setattr('fetch_hand_sim.episode_log.bag.COMPRESSION', compression)
     original = recorder.record(EpisodeDirectory(tmp_path))
     assert_same(original, episodes[0])
-    episode = read_episode(original)
-    with (tmp_path / 'loose.mcap').open('wb') as stream:
-        writer = Writer(stream, use_chunking=False)
-        writer.start(profile='ros2')
-        writer.add_metadata('episode', episode.metadata)
-        for name, topic in episode.topics.items():
-            text = schema_text(topic.type_name).encode()
-            schema_id = writer.register_schema(topic.type_name, 'ros2msg', text)
-            id = writer.register_channel(name, 'cdr', schema_id)
-            for each in topic.messages:
-                writer.add_message(id, each.log_time_ns, each.data, each.publish_time_ns)
-        writer.add_metadata('episode_result', episode.result)
-        writer.finish()
-    assert_same(tmp_path / 'loose.mcap', original)
 
 
 TOOLS = {
@@ -489,6 +425,7 @@ def later_command(parts):
         ('metadata episode_ticks', lambda p: p.with_episode(episode_ticks=None)),
         ('metadata joint_order', lambda p: p.with_episode(joint_order='["evil"]')),
         ('episode_result retorn', lambda p: p.with_result(retorn='0')),
+        ('episode_result return', lambda p: p.with_result(**{'return': '0.0'})),
         ('episode_result complete', lambda p: p.with_result(complete=None)),
         ('episode_result complete', lambda p: p.with_result(complete='maybe')),
         ('topics', without_the_last_command),
