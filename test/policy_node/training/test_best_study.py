@@ -74,10 +74,10 @@ def test_the_status_of_a_job_says_how_far_it_is_and_how_long_it_will_take(tmp_pa
 
 
 class Recorder:
-    """A place where jobs take no time; some of them fail."""
+    """A place where jobs take no time; one may end with another status than 0."""
 
-    def __init__(self, report: Path, limit: int, failing: tuple[str, ...] = ()) -> None:
-        self.report, self.limit, self.failing = report, limit, failing
+    def __init__(self, report: Path, limit: int, task: str = '', status: int = 0) -> None:
+        self.report, self.limit, self.failing, self.status = report, limit, task, status
         self.running: list[Job] = []
         self.order: list[str] = []
         self.most = 0
@@ -89,8 +89,8 @@ class Recorder:
 
     def wait(self) -> tuple[Job, int]:
         job = self.running.pop(0)
-        if job.config.task in self.failing:
-            return job, 1
+        if job.config.task == self.failing:
+            return job, self.status
         job.folder.mkdir(parents=True)
         counters = Counters(env_steps=job.config.total_steps)
         state = TrainingState({}, counters, {'config': {}})
@@ -118,18 +118,23 @@ def test_jobs_run_as_many_at_once_as_allowed_and_after_what_they_need(
     assert "benchmark: no report yet: [Errno 28] No space left on device: 'runs.csv'" in said
 
 
-def test_a_job_that_fails_stops_only_what_starts_from_it(tmp_path: Path) -> None:
-    place = Recorder(tmp_path, limit=2, failing=('HandManipulateBlockRotateXYZ',))
-    jobs = jobs_of('--output', str(tmp_path))
+def test_a_job_that_fails_stops_only_what_starts_from_it_and_a_signal_stops_all(
+    tmp_path: Path,
+) -> None:
+    failing, jobs = 'HandManipulateBlockRotateXYZ', jobs_of('--output', str(tmp_path))
+    stopped = Recorder(tmp_path, 1, jobs[0].config.task, 143)
+    assert run_jobs(jobs, stopped, tmp_path, lambda: None) == 143
+    assert stopped.order == [jobs[0].config.task]
+    place = Recorder(tmp_path, 2, failing, 1)
     assert run_jobs(jobs, place, tmp_path, lambda: None) == 1
-    lost: set[str] = set()
+    lost = {failing}
     for task in BEST.tasks:
-        if task in BEST.starts and BEST.starts[task].task in lost | set(place.failing):
+        if task in BEST.starts and BEST.starts[task].task in lost:
             lost.add(task)
-    assert set(place.order) == set(TASKS) - lost
+    assert set(place.order) == set(TASKS) - lost | {failing}
     again = Recorder(tmp_path, limit=2)
     assert run_jobs(jobs, again, tmp_path, lambda: None) == 0
-    assert set(again.order) == lost | set(place.failing)
+    assert set(again.order) == lost
 
 
 # Nine processes that load torch: on a busy machine that takes its time.

@@ -41,6 +41,7 @@ from policy_node.training.studies.store import (
 from policy_node.training.studies.study import Job, Study, to_settings
 from support import ROOT
 from support.full_disk import files_at_most
+from support.runs import one_line
 
 torch.set_num_threads(1)
 
@@ -125,13 +126,15 @@ def run(area: float, steps: int | None, final: float) -> dict[str, object]:
 
 def test_a_censored_run_is_slower_than_any_other() -> None:
     row = sum_up([run(0.1, None, 0.5), run(0.2, 300, 0.9), run(0.3, 100, 1.0)])
-    assert (row['steps_to_0.9_median'], row['reached'], row['area_median']) == (300, 2, 0.2)
-    row = sum_up([run(0.1, None, 0.5), run(0.2, None, 0.9), run(0.3, 100, 1.0)])
-    assert (row['steps_to_0.9_median'], row['reached']) == ('', 1)
-    row = sum_up([run(0.1, 300, 0.9), run(0.3, 100, 1.0)])
-    assert (row['steps_to_0.9_median'], row['reached']) == (200, 2)
-    row = sum_up([run(0.1, None, 0.5), run(0.3, 100, 1.0)])
-    assert (row['steps_to_0.9_median'], row['reached']) == ('', 1)
+    assert row['area_median'] == 0.2
+    for steps, median, reached in (
+        ((None, 300, 100), 300, 2),
+        ((None, None, 100), '', 1),
+        ((300, 100), 200, 2),
+        ((None, 100), '', 1),
+    ):
+        row = sum_up([run(0.1, each, 0.9) for each in steps])
+        assert (row['steps_to_0.9_median'], row['reached']) == (median, reached)
 
 
 def test_significance_needs_disjoint_quartiles_and_a_small_p() -> None:
@@ -173,25 +176,26 @@ def test_the_chance_of_a_rank_sum_is_counted() -> None:
 
 
 @pytest.mark.release
-def test_a_study_runs_measures_and_gives_the_same_bits_again(
+def test_a_study_is_run_measured_extended_and_measured_again(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Beside stored runs of another task."""
-    report = tmp_path / 'report'
+    report, first, today = (tmp_path / name for name in ('report', 'first', 'today'))
     report.mkdir()
     stored = read_runs(ROOT / 'docs' / 'research' / 'unbiased')
     kept = [run for run in stored.values() if run['task'] == 'FetchPush']
     for run in kept:
         add_run(report, run)
     (report / 'README.md').write_text(f'# Before\n{BEGIN}\nold\n{END}\nafter\n')
-    arguments = [*SMALL, '--arms', 'future', 'weighted', '--report', str(report)]
-    assert main([*arguments, '--output', str(tmp_path / 'first')]) == 0
+    arguments = [*SMALL, '--arms', 'future', 'weighted', '--report', str(report), '--output']
+    assert main([*arguments, str(first)]) == 0
     assert 'FetchReach/weighted/seed0 is finished; 0 to go' in capsys.readouterr().out
     runs = list(read_runs(report).values())
     assert runs[:-2] == kept
     for arm, run in zip(('future', 'weighted'), runs[-2:], strict=True):
-        assert (run['arm'], run['env_steps'], run['parts']) == (arm, 800, 1)
-        assert run['curve'][-1][0] == 800
+        assert (run['arm'], run['seed'], run['env_steps'], run['parts']) == (arm, 0, 800, 1)
+        assert run['curve'][-1][0] == 800 and run['machine'].endswith(' cores')
+        assert 0.0 <= run['final_success'] <= 1.0 and run['final_episodes'] == 4
         assert run['processor_seconds'] > 0 and run['command'].startswith(
             'fetch_hand_sim benchmark --study unb'
         )
@@ -200,40 +204,38 @@ def test_a_study_runs_measures_and_gives_the_same_bits_again(
     assert '\n| FetchReach | `weighted`: half future, half actual, importance weights | 1' in page
     assert '\n| FetchPush | `future`' in page
     assert (report / 'figure.png').read_bytes()[:4] == b'\x89PNG'
-    again = tmp_path / 'again'
-    assert main([*SMALL, '--arms', 'future', '--report', str(again), '--output', str(again)]) == 0
-    actor = Path('FetchReach') / 'future' / 'seed0' / 'latest.safetensors'
-    same = [folder.joinpath(actor).read_bytes()[-40_000:] for folder in (tmp_path / 'first', again)]
-    assert same[0] == same[1]
 
-
-@pytest.mark.release
-def test_a_stored_run_is_not_trained_again_and_another_seed_is_added(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Also if the run folder was on another machine."""
-    report = tmp_path / 'report'
-    arguments = [*SMALL, '--arms', 'actual', '--report', str(report), '--output']
-    assert main([*arguments, str(tmp_path / 'gone')]) == 0
-    (first,) = read_runs(report).values()
-    assert first['seed'] == 0 and first['machine'].endswith(' cores')
-    assert 0.0 <= first['final_success'] <= 1.0 and first['final_episodes'] == 4
-    today = tmp_path / 'today'
-    capsys.readouterr()
-    assert main([*arguments, str(today), '--seeds', '0', '1']) == 0
+    # Another seed is added, also if the run folder was on another machine.
+    assert main([*arguments, str(today), '--arms', 'future', '--seeds', '0', '1']) == 0
     assert f'1 of 2 runs are in {report}; other --report' in capsys.readouterr().out
     assert not list(today.glob('*/*/seed0')) and list(today.glob('*/*/seed1'))
-    runs = list(read_runs(report).values())
-    assert runs[0] == first and [run['seed'] for run in runs] == [0, 1]
-    assert '| 2 | ' in (report / 'README.md').read_text()
-    kept = {path.name: path.read_bytes() for path in report.iterdir()}
-    for other in (['--arms', 'actual'], ['--arms', 'random']):
-        refused = [*arguments, str(tmp_path / 'other'), *other, '--set', 'batch_size=32']
-        assert main(refused) == 2
-        error = capsys.readouterr().err
-        assert 'FetchReach/actual with batch_size 256, now 32' in error
-        assert error.count('\n') == 1 and not (tmp_path / 'other').exists()
-    assert {path.name: path.read_bytes() for path in report.iterdir()} == kept
+    *before, added = read_runs(report).values()
+    assert before == runs and (added['arm'], added['seed']) == ('future', 1)
+    files = {path.name: path.read_bytes() for path in report.iterdir()}
+    for arm in ('future', 'random'):
+        other = [*arguments, str(tmp_path / 'other'), '--arms', arm, '--set', 'batch_size=32']
+        assert main(other) == 2
+        assert '/future with batch_size 256, now 32' in one_line(capsys)
+        assert not (tmp_path / 'other').exists()
+    assert {path.name: path.read_bytes() for path in report.iterdir()} == files
+
+    # Runs without stored measures are measured again without training, unless they are damaged.
+    folder, jsonl = first / 'FetchReach' / 'future' / 'seed0', report / 'runs.jsonl'
+    log = (folder / 'progress.csv').read_bytes()
+    jsonl.unlink()
+    assert main([*arguments, str(first)]) == 0
+    assert list(read_runs(report).values()) == runs[-2:]
+    assert (folder / 'progress.csv').read_bytes() == log
+    jsonl.unlink()
+    capsys.readouterr()
+    for name, content, status, line in (
+        ('latest.safetensors', b'cut', 1, 'fetch_hand_sim benchmark: FetchReach/future/seed0: '),
+        ('progress.csv', b'env_steps\n400\n', 1, 'progress.csv contains no evaluation'),
+        (STATE_FILE, b'cut', 2, f'Remove {folder} to train it again'),
+    ):
+        write_file(folder / name, content)
+        assert main([*arguments, str(first), '--arms', 'future']) == status
+        assert line in one_line(capsys)
 
 
 def store(folder: Path, jobs: list[Job], machine: str = 'A', seconds: float = 10.0) -> None:
@@ -314,33 +316,6 @@ def test_processes_that_store_runs_at_once_lose_nothing(tmp_path: Path) -> None:
     with ThreadPoolExecutor(len(jobs)) as pool:
         list(pool.map(lambda job: store(tmp_path, [job]), jobs))
     assert sorted(seed for *_, seed in read_runs(tmp_path)) == [0, 1, 2, 3, 4]
-
-
-@pytest.mark.release
-def test_a_run_with_a_damaged_actor_or_log_is_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    report = tmp_path / 'report'
-    arguments = [*SMALL, '--arms', 'actual', '--output', str(tmp_path), '--report', str(report)]
-    assert main(arguments) == 0
-    folder = tmp_path / 'FetchReach' / 'actual' / 'seed0'
-    (run,), log = read_runs(report).values(), (folder / 'progress.csv').read_bytes()
-    (report / 'runs.jsonl').unlink()
-    assert main(arguments) == 0, 'measured again without training'
-    assert list(read_runs(report).values()) == [run]
-    assert (folder / 'progress.csv').read_bytes() == log
-    (report / 'runs.jsonl').unlink()
-    capsys.readouterr()
-    write_file(folder / 'latest.safetensors', b'cut')
-    assert main(arguments) == 1
-    error = capsys.readouterr().err
-    assert 'fetch_hand_sim benchmark: FetchReach/actual/seed0: ' in error and error.count('\n') == 1
-    write_file(folder / 'progress.csv', b'env_steps\n400\n')
-    assert main(arguments) == 1
-    assert 'progress.csv contains no evaluation' in capsys.readouterr().err
-    write_file(folder / STATE_FILE, b'cut')
-    assert main(arguments) == 2
-    assert f'Remove {folder} to train it again' in capsys.readouterr().err
 
 
 def test_a_full_disk_leaves_stored_runs_and_page_as_they_were(
