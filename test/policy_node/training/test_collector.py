@@ -78,13 +78,6 @@ def test_noise_has_the_spread_and_the_share_asked_for(epsilon):
     assert inside.std() == pytest.approx(0.1, abs=0.012)
 
 
-def test_the_second_cycle_has_new_goals():
-    collector = make_collector()
-    first, _ = collector.collect(make_actor())
-    second, _ = collector.collect(make_actor())
-    assert (first.desired_goal != second.desired_goal).all()
-
-
 def test_the_same_seeds_give_the_same_episodes_in_any_thread():
     here, _ = make_collector().collect(make_actor())
     with ThreadPoolExecutor(1) as executor:

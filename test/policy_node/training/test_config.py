@@ -56,10 +56,6 @@ def test_recipes_exist_for_every_task_and_survive_json(task, recipe):
     assert config_from_dict(stored) == config
 
 
-def test_every_field_is_explained():
-    assert all(each.meaning.endswith('.') for each in FIELDS.values())
-
-
 def switches():
     """Rows of the tables of switches in the reference, by field."""
     page = (ROOT / 'docs' / 'reference' / 'training_fields.md').read_text()
@@ -84,20 +80,6 @@ def test_what_a_study_switches_is_on_the_page_with_a_request():
         assert re.match('[1-9]', request), field
 
 
-@pytest.mark.parametrize(
-    ('text', 'expected'),
-    [
-        ('gamma=0.95', ('gamma', 0.95)),
-        ('total_steps=1_000', ('total_steps', 1000)),
-        ('layer_norm=true', ('layer_norm', True)),
-        ('hidden_sizes=512,256', ('hidden_sizes', (512, 256))),
-        ('strategy=final', ('strategy', 'final')),
-    ],
-)
-def test_assignments_take_the_type_of_the_field(text, expected):
-    assert parse_assignment(text) == expected
-
-
 def test_scalars_of_numpy_are_values_of_python():
     """Those of `np.linspace`, and of what was read from a file."""
     given = {
@@ -119,7 +101,6 @@ def test_scalars_of_numpy_are_values_of_python():
     [
         ('gamma', "'gamma' is not name=value: give gamma="),
         ('zzz=1', 'is not name=value; names: task, '),
-        ('gamma=high', "gamma 'high' is not of type float"),
         ('layer_norm=maybe', "layer_norm 'maybe' is not of type bool"),
         ('num_envs=1.5', "num_envs '1.5' is not of type int"),
         ('hidden_sizes=wide', "hidden_sizes 'wide' is not numbers with commas"),
@@ -138,29 +119,20 @@ def test_bad_assignments_are_refused(text, match):
         ({'gamma': 1.0}, 'gamma 1.0; allowed: 0 ... 0.999999'),
         ({'batch_size': 0}, 'batch_size 0; allowed: 1'),
         ({'noise_std': float('inf')}, 'noise_std inf is no finite number'),
-        ({'hidden_sizes': ()}, 'hidden_sizes'),
-        ({'goals': 'past=1'}, 'past'),
+        ({'hidden_sizes': (0,)}, 'allowed: 1 to 64 widths'),
         ({'goals': 'future=.5', 'strategy': 'none'}, 'excludes strategy none'),
         ({'ticks_after_drop': 3}, 'FetchPush has no palm to drop an object from'),
         ({'first_rotation': 2.0}, 'goals of FetchPush have no rotation'),
         ({'task': 'HandManipulatePenRotate', 'first_distance': 8.0}, 'does not count'),
-        (
-            {'task': 'HandReach', 'first_distance': 2.0},
-            'first_distance 2.0 has no effect: it needs reward_type sparse',
-        ),
         ({'reward_grades': '2,1'}, 'rising numbers above 0 and below 1000'),
-        ({'reward_grades': 'all'}, "reward_grades 'all' is not numbers"),
         ({'reward_grades': '1,2', 'condition': 'threshold'}, 'reward_grades .* without condition'),
         ({**PEN, 'ticks_after_drop': -1, 'drop_is_lost': True}, 'it needs ticks_after_drop'),
-        ({**PEN, 'drop_is_lost': True, 'reward_type': 'dense'}, 'and reward_type sparse'),
         ({**PEN, 'drop_is_lost': True, 'condition': 'horizon'}, 'without condition horizon'),
         ({'trace': 0.5}, 'trace 0.5 has no effect'),
-        ({'retry_failed': 0.5}, 'unknown configuration fields: retry_failed'),
         (
             {'importance': 'density', 'goals': 'future=1'},
             'density needs goals of the episode .* beside others',
         ),
-        ({'goal_choice': 'bellman', 'n_step': 3}, 'n_step 3 excludes goal_choice bellman'),
         ({'correction': 'cut'}, "correction 'cut' has no effect: it needs n_step other than 1"),
         ({'quantiles': 5, 'norm': 'batch', 'target': 'none'}, 'exclude .* norm batch'),
         ({'quantiles': 5, 'init_from': 'FetchReach'}, 'init_from excludes quantiles 5'),
@@ -170,26 +142,17 @@ def test_bad_assignments_are_refused(text, match):
         ({'condition': 'horizon', 'n_step': 3}, 'n_step 3 excludes condition horizon'),
         ({'condition': 'threshold', 'reward_type': 'dense'}, 'needs reward_type sparse'),
         ({'widest_threshold': 32.0}, 'has no effect: it needs condition threshold'),
-        ({'widest_threshold': 0.5, 'condition': 'threshold'}, 'allowed: 1 ... 10000'),
         ({'importance': 'density', 'strategy': 'random'}, 'density needs goals of the episode'),
         ({'noise_seconds': 0.01}, 'noise_seconds 0.01 is less than a tick of 0.04 s'),
         ({'longest_hold': 5, 'noise_seconds': 0.04}, 'longest_hold .* excludes noise_seconds'),
-        ({'longest_hold': 5, 'condition': 'horizon'}, 'longest_hold 5 excludes condition horizon'),
-        ({'longest_hold': 5, 'init_from': 'FetchReach'}, 'init_from excludes'),
         ({'past_actions': 3, 'longest_hold': 5}, 'past_actions needs longest_hold=1'),
-        ({'advantage': True}, 'advantage True has no effect: it needs .* discount time'),
         (
             {'advantage': True, 'discount': 'time', 'critics': 2},
             'advantage True has no effect: .* one critic',
         ),
-        ({'discount': 'second'}, "discount 'second'; allowed: tick, time"),
         ({'subgoal_every': 51}, 'subgoal_every 51 is longer than an episode'),
-        ({'subgoal_every': -1}, 'subgoal_every -1; allowed: 0'),
         ({'subgoal_every': 9, 'n_step': 3}, 'n_step 3 has no effect: it needs .* no subgoal_every'),
-        ({'subgoal_every': 9, 'parameter_noise': True}, 'parameter_noise True has no effect'),
         ({'subgoal_every': 9, 'importance': 'density'}, 'density. has no effect: it needs algo'),
-        ({'subgoal_every': 9, 'init_from': 'FetchReach'}, 'init_from excludes .*subgoal_every'),
-        ({'subgoal_every': 9, **PPO}, 'subgoal_every 9 has no effect: it needs algorithm ddpg'),
         (
             {'subgoal_prior': 0.1, 'longest_hold': 5},
             'subgoal_prior 0.1 has no effect: .* without .* longest_hold',
@@ -199,15 +162,11 @@ def test_bad_assignments_are_refused(text, match):
         ({**PPO, 'random_epsilon': 0.2}, 'random_epsilon 0.2 has no effect'),
         ({**PPO, 'init_from': 'FetchReach'}, 'init_from excludes algorithm ppo'),
         ({**PPO, 'noise_std': 0.0}, 'noise_std 0.0; allowed: 1e-06 or more'),
-        ({**PPO, 'first_value': 1.0}, 'first_value 1.0; allowed: -1000000 ... 0'),
         ({'importance': 'decision'}, 'has no effect: it needs algorithm ppo'),
         ({'goals': 'outcome=.8'}, 'goals outcome needs algorithm ppo'),
         ({'first_value': -50.0}, 'has no effect: it needs algorithm ppo'),
         ({'total_steps': 10**400}, 'total_steps is too large; allowed: up to 9007'),
         ({'gamma': 10**400}, 'gamma 1.* is not of type float'),
-        ({'hidden_sizes': (10**400,)}, 'allowed: 1 to 64 widths'),
-        ({'control_hz': 0.0}, 'control_hz'),
-        ({'control_hz': float('nan')}, 'control_hz'),
         ({'control_hz': 60.0}, 'control_hz'),
     ],
 )
@@ -222,28 +181,18 @@ def test_bad_values_are_refused(changes, match):
     [
         ({}, []),
         ({'learning_starts': 100_000}, ['nothing']),
-        ({'updates_per_cycle': 0}, ['nothing']),
-        ({'learning_rate': 0.0}, ['nothing']),
-        ({'critic_first': 10_000}, ['the actor']),
         ({'learning_rate': 1e-30}, ['nothing']),
         ({'critic_first': 1401, 'policy_delay': 700}, ['the actor']),
         ({'actor_average': 1 - 1e-6}, ['evaluated']),
-        ({'polyak': 1.0}, ['targets']),
         ({'polyak': 1 - 1e-9}, ['targets']),
         ({'target_update_interval': 10**9}, ['targets']),
-        ({'noise_std': 1e9}, ['policy will']),
         ({**PPO, 'noise_std': 1e9}, ['policy will']),
         ({**PPO, 'learning_starts': 100_000}, ['nothing']),
     ],
 )
 def test_idle_parts_of_learning_are_named_in_a_line(changes, idle):
     lines = [*idle_parts(recipe_config('FetchReach', 'best', **changes))]
-    assert [
-        word
-        for word in ('nothing', 'the actor', 'evaluated', 'targets', 'policy will')
-        if word in str(lines)
-    ] == idle
-    assert len(lines) == len(idle)
+    assert all(word in line for word, line in zip(idle, lines, strict=True))
 
 
 def test_an_unknown_recipe_or_stored_field_is_refused():
@@ -321,7 +270,6 @@ def test_options_become_fields_of_their_types_and_nothing_else_is_set():
         (['--learning-rte', '1'], "--learning-rte 1; did you mean '--learning-rate'?"),
         (['--nosuchthing'], 'unrecognized arguments: --nosuchthing'),
         (['--gamble', 'true'], 'switches take no value: --name is on, --no-name is off'),
-        (['--steps', '1e6.5'], "total_steps '1e6.5' is not of type int"),
         (['--steps', '1e29'], "total_steps '1e29' is not of type int"),
     ],
 )

@@ -7,6 +7,8 @@ import pytest
 import torch
 
 from fetch_hand_sim.simulation import Simulation
+from fetch_hand_sim.simulation.rewards import GoalMetric
+from msgs_spec.tasks import task_spec
 from policy_node.policies.actor import Actor
 from policy_node.policies.network_shape import NetworkShape
 from policy_node.training.configuration.config import TrainConfig
@@ -76,25 +78,8 @@ def test_values_discount_ticks_or_time(
     lower, end = torch.full((1,), -100.0), torch.zeros(1)
     lowest = learner_of(config).targets(lower, end, torch.zeros(1, 3))
     assert lowest.item() == pytest.approx(-share / (1.0 - gamma))
-
-
-def test_rewards_of_a_batch_are_those_of_a_tick_of_time() -> None:
-    metric = Simulation('FetchReach', num_threads=1).metric
-    episodes = Episodes(
-        observation=np.zeros((1, 21, 10), np.float32),
-        achieved_goal=np.zeros((1, 21, 3), np.float32),
-        desired_goal=np.ones((1, 3), np.float32),
-        action=np.zeros((1, 20, 4), np.float32),
-    )
-    for n_step in (1, 10):
-        config = config_at(250.0, discount='time', n_step=n_step)
-        sampler = make_sampler(config, metric)
-        row = np.zeros(50, np.int64)
-        batch = sampler.sample(episodes, row, {'real': 1.0}, np.random.default_rng(0))
-        steps = np.round(np.log(batch.discount.astype(float)) / np.log(config.tick_gamma))
-        assert steps.max() == n_step
-        expected = -0.1 * (1 - config.tick_gamma**steps) / (1 - config.tick_gamma)
-        np.testing.assert_allclose(batch.reward, expected, rtol=1e-5)
+    sampler = make_sampler(config, GoalMetric(task_spec('FetchReach', control_hz=control_hz)))
+    assert (sampler.reward_scale, sampler.gamma) == pytest.approx((share, gamma))
 
 
 def collected(**options: object) -> Episodes:
