@@ -17,9 +17,7 @@ from safetensors import safe_open
 from safetensors.numpy import save_file
 
 from policy_node.policies import checkpoint
-from policy_node.policies.actor import Actor
 from policy_node.policies.files import read_tensors
-from policy_node.policies.network_shape import NetworkShape
 from support.fresh_actor import fresh_actor
 
 
@@ -93,14 +91,11 @@ def test_missing_metadata_are_rejected(saved: Path) -> None:
     ('name', 'values', 'match'),
     [
         ('goal_normalizer.mean', np.zeros(5, np.float32), r'goal_normalizer.mean \(5,\)'),
-        ('goal_normalizer.mean', None, 'goal_normalizer.mean none'),
         ('goal_normalizer.mean', np.zeros(3), 'float64'),
         ('goal_normalizer.std', np.zeros(3, np.float32), 'goal_normalizer.std'),
-        ('extra', np.zeros(1, np.float32), r'extra \(1,\)'),
         # Escape characters never reach the terminal.
         ('\x1b[31mred', np.zeros(1, np.float32), r'red \(1,\).* none'),
         ('network.output.bias', np.float32([0, 0, np.nan, 0]), 'network.output.bias'),
-        ('network.output.bias', np.float32([np.inf, 0, 0, 0]), 'network.output.bias'),
     ],
 )
 def test_invalid_tensors_are_rejected(
@@ -120,24 +115,16 @@ def test_invalid_tensors_are_rejected(
         ('format', 'something', 'something'),
         ('hidden_sizes', '[40000, 40000]', r'hidden.0.bias \(8,\)'),
         ('hidden_sizes', '[-1]', r'hidden_sizes: \[-1\]'),
-        ('hidden_sizes', '[1e999]', 'hidden_sizes: inf'),
-        ('hidden_sizes', '[8.5]', '8.5'),
         ('hidden_sizes', '[true]', 'True'),
         ('hidden_sizes', '[' * 100_000 + ']' * 100_000, 'hidden_sizes'),
-        ('config', '{"a":' * 100_000, 'config'),
         ('config', '[]', r'config: \[\]'),
-        ('task', '{}', r'task: \{\}'),
         ('observation_layout', '[[["a"], 3]]', 'observation_layout'),
-        ('observation_layout', '7', 'observation_layout'),
-        ('goal_size', '"3"', "'3'"),
         ('goal_size', '7', 'has goal 7'),
         ('action_size', '20', 'has action 20'),
         ('observation_layout', '[["joints", 25]]', 'has observation .*joints'),
         ('task', '"FetchFly"', "'FetchFly'"),
-        ('hidden_sizes', '"wide"', 'wide'),
         ('layer_norm', '1', 'layer_norm: 1'),
         ('control_hz', 'NaN', 'control_hz'),
-        ('control_hz', '1e999', 'control_hz'),
         ('control_hz', '[25]', r'\[25\]'),
         ('seed', '9' * 5000, 'seed'),
         ('goal_features', '"\\u001b[31m"', 'goal_features'),
@@ -155,11 +142,8 @@ def test_invalid_metadata_are_rejected_at_once(
 @pytest.mark.parametrize(
     ('header', 'match'),
     [
-        (b'{' * 1000, 'safetensors'),
-        (b'[]', 'safetensors'),
         (b'{"a": 1}', 'safetensors'),
         (b'{"__metadata__": []}', 'safetensors|format None'),
-        (b'{"a": {"shape": 1, "dtype": []}}', 'safetensors'),
         (b'[' + b'[],' * 700_000 + b'[]]', r'header of \d+ bytes'),
     ],
 )
@@ -167,13 +151,3 @@ def test_crafted_headers_are_refused_in_one_line(tmp_path: Path, header: bytes, 
     path = tmp_path / 'a.safetensors'
     path.write_bytes(len(header).to_bytes(8, 'little') + header)
     assert_refused(path, match)
-
-
-@pytest.mark.parametrize('layer_norm', [False, True])
-@pytest.mark.parametrize('hidden_sizes', [(), (8,), (8, 16, 4)])
-def test_names_and_shapes_of_tensors_are_those_of_the_actor(
-    hidden_sizes: tuple[int, ...], layer_norm: bool
-) -> None:
-    shape = NetworkShape(25, 3, 4, hidden_sizes, layer_norm)
-    state = Actor(shape).state_dict()
-    assert {name: tuple(value.shape) for name, value in state.items()} == shape.tensor_shapes()

@@ -13,9 +13,7 @@ from msgs_spec.rotations import (
     quaternion_to_matrix,
 )
 from msgs_spec.tasks import TASKS, GoalKind, task_spec
-from policy_node.policies.actor import Actor
 from policy_node.policies.goal_features import RelativeGoal, goal_features
-from policy_node.policies.network_shape import NetworkShape
 from support.tasks import each_task
 
 POSE_TASKS = [name for name, spec in TASKS.items() if spec.goal is GoalKind.POSE]
@@ -50,23 +48,6 @@ def test_the_achieved_goal_is_at_its_specified_place(task: str) -> None:
     spec = simulation.spec
     part = slice(spec.achieved_goal_start, spec.achieved_goal_start + spec.goal.size)
     assert (observation['observation'][:, part] == observation['achieved_goal']).all()
-
-
-@pytest.mark.parametrize('kind', ['plain', 'relative', 'symmetric'])
-@pytest.mark.parametrize('task', list(TASKS))
-def test_the_number_of_inputs_matches_the_shape(task: str, kind: str) -> None:
-    spec = task_spec(task)
-    if kind == 'symmetric' and task not in POSE_TASKS:
-        with pytest.raises(ValueError, match='no object pose'):
-            goal_features(kind, spec)
-        return
-    sizes = (spec.observation_size, spec.goal.size)
-    features = goal_features(kind, spec)
-    shape = NetworkShape(*sizes, spec.robot.action_size, (8,), goal_features=features)
-    actor = Actor(shape)
-    inputs = actor.features(torch.zeros(4, 2, sizes[0]), torch.zeros(4, 2, sizes[1]))
-    assert inputs.shape == (4, 2, shape.feature_size)
-    assert actor(inputs).shape == (4, 2, spec.robot.action_size)
 
 
 def test_rotation_is_goal_times_conjugate_with_its_sign() -> None:

@@ -74,11 +74,8 @@ def late(answer):
     return Late
 
 
-nan = late(lambda good: good * np.nan)
 outside = late(lambda good: good * 6)
-short = late(lambda good: good[:, :3])
 stops = late(lambda good: good / (1 // 0))
-nothing = 5
 number = lambda task: 7
 """
 
@@ -120,10 +117,8 @@ def test_a_function_answers_one_observation_and_batches_row_by_row(module: str) 
     ('function', 'line'),
     [
         ('fails', 'RuntimeError: no weights for FetchReach'),
-        ('missing', 'AttributeError: .*missing'),
         ('leaves', 'SystemExit: usage: for FetchReach'),
         ('Odd', "ValueError: .*'often'"),
-        ('nothing', 'TypeError: '),
         ('number', 'returned int'),
         ('wrong', r'returned \[0.\] .*\(4,\)'),
     ],
@@ -156,7 +151,7 @@ def test_a_function_is_evaluated_as_any_policy(
 
 @pytest.mark.parametrize(
     ('function', 'line'),
-    [('nan', 'nan'), ('outside', '1.5'), ('short', '(2, 3)'), ('stops', 'ZeroDivisionError')],
+    [('outside', '1.5'), ('stops', 'ZeroDivisionError')],
 )
 def test_a_policy_that_fails_later_is_one_line(
     module: str, function: str, line: str, capsys: pytest.CaptureFixture[str]

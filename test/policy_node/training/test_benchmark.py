@@ -13,7 +13,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 from policy_node.policies.checkpoint import read_info
 from policy_node.training.configuration.flat import to_flat
@@ -26,8 +25,7 @@ from policy_node.training.studies.command import jobs_from_arguments, main, pars
 from policy_node.training.studies.measures import Curve
 from policy_node.training.studies.report import aggregate, draw
 from policy_node.training.studies.workers import is_finished
-
-torch.set_num_threads(1)
+from support import wait_until
 
 # Jobs of a second or two: 8 simulations, 3 cycles, 2 of them evaluated.
 SMALL = [
@@ -98,10 +96,7 @@ def test_a_second_ctrl_c_ends_jobs_at_once(tmp_path: Path) -> None:
         tmp_path / 'FetchReach' / arm / 'seed0' / 'progress.csv'
         for arm in ('her_sparse', 'her_dense')
     ]
-    deadline = time.monotonic() + 120
-    while not all(log.is_file() for log in logs):
-        assert time.monotonic() < deadline and benchmark.poll() is None
-        time.sleep(0.05)
+    wait_until(lambda: all(log.is_file() for log in logs), 'log', 120.0)
     time.sleep(5.0)
     benchmark.send_signal(signal.SIGINT)
     with pytest.raises(subprocess.TimeoutExpired):

@@ -8,11 +8,9 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
-import torch
 
 from msgs_spec.tasks import TASKS
 from policy_node.policies import checkpoint
@@ -26,8 +24,7 @@ from policy_node.training.studies.command import jobs_from_arguments, main, pars
 from policy_node.training.studies.store import add_run
 from policy_node.training.studies.study import Job, to_settings
 from policy_node.training.studies.workers import LOG_FILE, run_jobs
-
-torch.set_num_threads(1)
+from support import wait_until
 
 TINY = [
     *['--study', 'best', '--set', 'num_envs=2', '--set', 'updates_per_cycle=2'],
@@ -147,11 +144,12 @@ def test_two_at_once_are_stopped_resumed_and_shipped(tmp_path: Path) -> None:
     first, second, other = (tmp_path / task / 'best' / 'seed0' for task in (*EGGS, 'FetchReach'))
     process = subprocess.Popen(module, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     try:
-        deadline = time.monotonic() + 300
         logs = [folder / 'progress.csv' for folder in (first, other)]
-        while not all(log.is_file() and log.read_text().count('\n') >= 2 for log in logs):
-            assert process.poll() is None and time.monotonic() < deadline
-            time.sleep(0.05)
+        wait_until(
+            lambda: all(log.is_file() and log.read_text().count('\n') >= 2 for log in logs),
+            'cycle of both jobs',
+            300.0,
+        )
         children = Path(f'/proc/{process.pid}/task/{process.pid}/children').read_text().split()
         sessions = {os.getsid(int(child)) for child in children}
         assert sessions == {os.getsid(process.pid)}, 'where Linux groups by session, `nice` holds'

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
-
 import numpy as np
 import pytest
 import torch
@@ -14,9 +12,6 @@ from policy_node.policies.network_shape import NetworkShape
 from policy_node.policies.policy import RestingPolicy
 from policy_node.training.configuration.flat import from_flat
 from policy_node.training.experience.collector import Collector
-from policy_node.training.experience.replay import Episodes
-
-torch.set_num_threads(1)
 
 
 def make_collector(noise_std=0.2, random_epsilon=0.3, envs=4):
@@ -28,11 +23,6 @@ def make_collector(noise_std=0.2, random_epsilon=0.3, envs=4):
 def make_actor():
     torch.manual_seed(0)
     return Actor(NetworkShape(10, 3, 4, (16,))).eval()
-
-
-def assert_equal(first, second):
-    for name in Episodes.__slots__:
-        np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
 
 
 def test_episodes_are_what_the_simulation_does_with_the_actions():
@@ -56,16 +46,6 @@ def test_episodes_are_what_the_simulation_does_with_the_actions():
     assert success == reached.mean()
 
 
-def test_without_noise_the_policy_acts_alone():
-    actor = make_actor()
-    episodes, _ = make_collector(0.0, 0.0).collect(actor)
-    inputs = {
-        'observation': episodes.observation[:, 7],
-        'desired_goal': episodes.desired_goal,
-    }
-    np.testing.assert_allclose(episodes.action[:, 7], actor.predict(inputs)[0], atol=1e-5)
-
-
 @pytest.mark.parametrize('epsilon', [0.0, 0.3])
 def test_noise_has_the_spread_and_the_share_asked_for(epsilon):
     episodes, _ = make_collector(0.1, epsilon, envs=20).collect(RestingPolicy(4))
@@ -76,10 +56,3 @@ def test_noise_has_the_spread_and_the_share_asked_for(epsilon):
     assert outside == pytest.approx(epsilon * (1 - 0.5**4), abs=0.04)
     inside = actions[(np.abs(actions) <= 0.5).all(axis=1)]
     assert inside.std() == pytest.approx(0.1, abs=0.012)
-
-
-def test_the_same_seeds_give_the_same_episodes_in_any_thread():
-    here, _ = make_collector().collect(make_actor())
-    with ThreadPoolExecutor(1) as executor:
-        there, _ = executor.submit(make_collector().collect, make_actor()).result()
-    assert_equal(here, there)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+
 import numpy as np
 import pytest
 import torch
@@ -19,8 +21,6 @@ from policy_node.training.research.critics import (
 )
 from policy_node.training.research.judged import bellman, uncertain
 from support.learners import SHAPE, make_learner
-
-torch.set_num_threads(1)
 
 
 def test_members_start_differently_and_have_an_axis_of_their_own() -> None:
@@ -167,43 +167,29 @@ def test_a_batch_norm_sees_states_and_next_states_together() -> None:
         norm.bias.uniform_(-0.5, 0.5)
         output.weight.mul_(0.4)
         output.bias.fill_(-0.7)
+    network = copy.deepcopy(torch.nn.Sequential(linear, norm, torch.nn.ReLU(), output))
     # Next states lie elsewhere: neither alone has the statistics of both.
     batch = scattered()
     batch.next_observation[:] = 0.3 * batch.next_observation + 1.5
     features, next_features = (
-        np.concatenate([seen, batch.goal], axis=1)
+        torch.from_numpy(np.concatenate([seen, batch.goal], axis=1))
         for seen in (batch.observation, batch.next_observation)
     )
     with torch.no_grad():
-        own, following = (
-            learner.actor(torch.from_numpy(seen)).numpy() for seen in (features, next_features)
-        )
-
-    def hidden(features: np.ndarray, action: np.ndarray) -> np.ndarray:
-        weight, bias = (tensor.detach().numpy().astype(float) for tensor in linear.parameters())
-        return np.concatenate([features, action], axis=1) @ weight.T + bias
-
-    def values(hidden: np.ndarray, mean: np.ndarray, variance: np.ndarray) -> np.ndarray:
-        weight, bias, out, offset = (
-            tensor.detach().numpy().astype(float)
-            for tensor in (*norm.parameters(), *output.parameters())
-        )
-        normalized = (hidden - mean) / np.sqrt(variance + 1e-5) * weight + bias
-        return np.maximum(normalized, 0.0) @ out[0] + offset[0]
-
-    now, then = hidden(features, batch.action), hidden(next_features, following)
-    both = np.concatenate([now, then])
-    statistics = both.mean(axis=0), both.var(axis=0)
-    target = batch.reward + batch.discount * values(then, *statistics)
-    error = values(now, *statistics) - np.clip(target, -2.0, 0.0)
+        own, following = learner.actor(features), learner.actor(next_features)
+        inputs = torch.cat([features, torch.from_numpy(batch.action)], dim=1)
+        next_inputs = torch.cat([next_features, following], dim=1)
+        both = network.train()(torch.cat([inputs, next_inputs]))[:, 0].numpy()
+        expected = network.eval()(torch.cat([features, own], dim=1)).mean().item()
+    value, next_value = np.split(both, 2)
+    target = batch.reward + batch.discount * next_value
     assert ((-2.0 < target) & (target < 0.0)).mean() > 0.5
     losses = learner.update(batch)
+    error = value - np.clip(target, -2.0, 0.0)
     assert losses.critic.item() == pytest.approx(np.square(error).mean(), rel=1e-4)
-    # A hundredth of the running statistics is replaced, once: the actor does not count.
-    mean, variance = 0.01 * both.mean(axis=0), 0.99 + 0.01 * both.var(axis=0, ddof=1)
-    np.testing.assert_allclose(norm.running_mean, mean, atol=1e-6)
-    np.testing.assert_allclose(norm.running_var, variance, rtol=1e-5)
-    expected = values(hidden(features, own), mean, variance).mean()
+    # The running statistics are replaced once: the actor does not count.
+    torch.testing.assert_close(dict(norm.named_buffers()), dict(network[1].named_buffers()))
+    assert norm.momentum == 0.01
     assert losses.value.item() == pytest.approx(expected, rel=1e-4)
 
 

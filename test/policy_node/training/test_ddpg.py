@@ -13,12 +13,8 @@ from policy_node.policies.network_shape import NetworkShape
 from policy_node.training.configuration.recipes import recipe_config
 from policy_node.training.experience.replay import Transitions
 from policy_node.training.machine import Workers, choose_device, uses_bfloat16
-from policy_node.training.research.judged import SCORES
 from policy_node.training.research.registry import make_ddpg
 from support import learners
-
-# Small products: more threads only wait for each other, and on a busy machine for very long.
-torch.set_num_threads(1)
 
 SHAPE = NetworkShape(observation_size=3, goal_size=2, action_size=2, hidden_sizes=(32, 32))
 CPU = torch.device('cpu')
@@ -118,31 +114,6 @@ def test_the_actor_update_leaves_the_critic_alone_and_normalizers_untouched():
         assert torch.equal(actor[name], value) == ('normalizer' in name), name
 
 
-@pytest.mark.parametrize(
-    ('layer_norm', 'precision'),
-    [
-        (False, 'float32'),
-        pytest.param(True, 'bfloat16', marks=pytest.mark.release),
-    ],
-)
-def test_it_finds_the_best_action(layer_norm, precision):
-    """Reward -|a - g|^2 without a future: the best action is the goal itself."""
-    learner = make_learner(
-        layer_norm, precision=precision, gamma=0.0, action_l2=0.0, learning_rate=3e-3
-    )
-    generator = np.random.default_rng(0)
-    for _ in range(300):
-        goal = generator.uniform(-0.7, 0.7, (128, 2)).astype(np.float32)
-        action = generator.uniform(-1, 1, (128, 2)).astype(np.float32)
-        nothing = np.zeros((128, 3), np.float32)
-        reward = -np.square(action - goal).sum(axis=1).clip(0, 1)
-        no_future = np.zeros(128, np.float32)
-        learner.update(Transitions(nothing, nothing, goal, action, reward, no_future))
-    goal = generator.uniform(-0.7, 0.7, (256, 2))
-    action, _ = learner.actor.predict({'observation': np.zeros((256, 3)), 'desired_goal': goal})
-    assert np.abs(action - goal).mean() < 0.2
-
-
 def test_the_averaged_actor_keeps_its_share_and_takes_the_rest_of_the_actor():
     config = recipe_config('FetchReach', 'paper', actor_average=0.9)
     learner = make_ddpg(NetworkShape(3, 2, 4, (8,)), config, CPU, Workers())
@@ -163,18 +134,6 @@ def test_learning_rates_fall_linearly_to_the_share_asked_for():
         learner.set_progress(progress)
         for optimizer in learner.optimizers().values():
             assert optimizer.param_groups[0]['lr'] == pytest.approx(expected)
-
-
-@pytest.mark.parametrize('name', ['bellman', 'uncertain'])
-def test_goals_are_judged_as_precisely_as_values_are_learnt(name):
-    """In bfloat16, where updates are: it takes half of the time."""
-    judged = {}
-    for precision in ('float32', 'bfloat16'):
-        learner = make_learner(precision=precision, critics=2)
-        judged[precision] = SCORES[name](learner, make_batch())
-        assert judged[precision].dtype == np.float32
-    assert not np.array_equal(judged['float32'], judged['bfloat16'])
-    np.testing.assert_allclose(judged['bfloat16'], judged['float32'], atol=0.02)
 
 
 def test_under_bfloat16_the_output_layer_stays_float32():

@@ -29,8 +29,6 @@ from policy_node.training.research.registry import (
     network_shape,
 )
 
-torch.set_num_threads(1)
-
 TICKS = 500
 
 

@@ -34,8 +34,6 @@ from policy_node.training.research.registry import make_collector
 from policy_node.training.runs.run_log import RunLog, read_progress
 from support.runs import STATE, resumed, same, trainer_of, weights
 
-torch.set_num_threads(1)
-
 CPU = torch.device('cpu')
 
 

@@ -14,8 +14,6 @@ from policy_node.training.learners.imagined import ImaginingDDPG
 from policy_node.training.machine import Workers
 from support.runs import resumed, same, trained
 
-torch.set_num_threads(1)
-
 SHAPE = NetworkShape(10, 3, 4, (64, 64))
 
 

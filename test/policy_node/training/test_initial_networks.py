@@ -300,11 +300,6 @@ def test_finetune_starts_from_the_shipped_networks(task):
     assert networks.fitted(config).shape == network_shape(config)
 
 
-def test_finetune_needs_an_object_in_the_hand():
-    with pytest.raises(ValueError, match='HandReach'):
-        recipe_config('HandReach', 'finetune')
-
-
 @pytest.mark.parametrize(
     'changes', [{'reward_type': 'dense'}, {'control_hz': 250.0}, {'norm': 'layer'}]
 )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
+
 import numpy as np
 import pytest
 
@@ -71,6 +73,7 @@ class Judge:
 @pytest.mark.parametrize(
     'sampler',
     [
+        TransitionSampler(nearness, 0.9),
         TransitionSampler(nearness, 0.9, 2),
         TransitionSampler(nearness, 0.9, 5),
         TransitionSampler(nearness, 0.9, 100),
@@ -78,15 +81,19 @@ class Judge:
         CuttingSampler(nearness, 0.9, 5, cut_distance=0.8, judge=Judge()),
         HoldingSampler(nearness, 0.9, LONGEST),
     ],
-    ids=['2', '5', '100', 'lambda', 'cut', 'held'],
+    ids=['1', '2', '5', '100', 'lambda', 'cut', 'held'],
 )
 def test_every_step_of_a_return_is_rewarded_for_the_goal_of_its_row(episodes, sampler, valid):
     generator = np.random.default_rng(2)
     batch = sampler.sample(episodes, ROW, MIXTURE, generator, valid)
     assert_rewards_are_those_of_a_loop(episodes, batch, lambda _, *goals: nearness(*goals))
     tick, steps = batch.observation[:, 1].astype(int), steps_of(batch)
+    np.testing.assert_array_equal(batch.action, episodes.action[ROW, tick])
     left = (TICKS if valid is None else valid[ROW]) - tick
-    assert (steps >= 1).all() and (steps <= left).all() and len(set(steps)) > 1
+    assert (steps >= 1).all() and (steps <= left).all()
+    assert len(set(steps)) > 1 or sampler.most_steps == 1
+    assert (batch.observation[:, 0] == ROW).all()
+    assert {getattr(batch, each.name).dtype for each in fields(batch)} == {np.dtype(np.float32)}
     if isinstance(sampler, HoldingSampler):
         np.testing.assert_array_equal(steps, np.minimum(HELD[ROW, tick], left))
     elif type(sampler) is TransitionSampler:

@@ -7,7 +7,6 @@ import numpy as np
 from policy_node.policies.actor import Normalizer
 from policy_node.training.experience.experience import RunningStatistics
 from policy_node.training.machine import Workers
-from support.runs import same
 
 
 def test_statistics_over_parts_are_those_of_everything():
@@ -35,12 +34,3 @@ def test_nothing_seen_changes_nothing():
     statistics.update(np.zeros((0, 3)), Workers())
     statistics.write(normalizer)
     assert normalizer.std.tolist() == [1.0, 1.0, 1.0]
-
-
-def test_state_continues():
-    first, second = RunningStatistics(1), RunningStatistics(1)
-    first.update([[1.0], [2.0]], Workers())
-    second.load_state_dict(first.state_dict())
-    for statistics in (first, second):
-        statistics.update([[6.0]], Workers())
-    assert same(first.state_dict(), second.state_dict())

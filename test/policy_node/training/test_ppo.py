@@ -29,8 +29,6 @@ from policy_node.training.research.rollouts import (
 )
 from support.runs import resumed, trained
 
-torch.set_num_threads(1)
-
 ON_POLICY = {'algorithm': 'ppo', 'overlap': False, 'random_epsilon': 0.0, 'noise_std': 0.3}
 
 
@@ -55,16 +53,10 @@ def test_densities_of_several_parts_multiply_and_have_gradients_beyond_the_limit
     assert gradient[0, 0] > 0 > gradient[0, 1]
 
 
-def test_weights_make_actions_for_one_goal_those_for_another() -> None:
-    """Two steps of Gaussian actions around 0, weighed as if they were around 0.5."""
-    actions = np.random.default_rng(0).standard_normal((400_000, 2))
-    log_ratio = 0.5 * np.square(actions) - 0.5 * np.square(actions - 0.5)
-    weight = decision_weights(log_ratio)
-    np.testing.assert_allclose(weight.mean(axis=0), 1.0)
-    assert (weight[:, 0] * actions[:, 0]).mean() == pytest.approx(0.5, abs=0.01)
-    assert (weight[:, 1] * actions[:, 1]).mean() == pytest.approx(0.5, abs=0.02)
-    assert (weight[:, 1] * actions[:, 0]).mean() == pytest.approx(0.5, abs=0.02), 'the past counts'
-    assert (weight[:, 0] * actions[:, 1]).mean() == pytest.approx(0.0, abs=0.02), 'no later action'
+def test_the_weight_of_an_action_is_the_product_of_all_ratios_so_far() -> None:
+    log_ratio = np.random.default_rng(0).normal(size=(50, 3))
+    product = np.cumprod(np.exp(log_ratio), axis=1)
+    np.testing.assert_allclose(decision_weights(log_ratio), product / product.mean(axis=0))
 
 
 def test_advantages_of_actions_for_another_goal_are_right_on_average_at_any_trace() -> None:

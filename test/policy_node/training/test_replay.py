@@ -31,12 +31,6 @@ def test_the_ring_keeps_the_latest_episodes_whole():
         assert (flat == held.desired_goal[:, :1]).all()
 
 
-def test_select_keeps_rows_together():
-    chosen = numbered(0, 4).select(np.array([False, True, False, True]))
-    assert len(chosen) == 2 and chosen.ticks == 3
-    assert chosen.action[:, 0, 0].tolist() == [1, 3] == chosen.observation[:, 2, 1].tolist()
-
-
 def test_what_cannot_fit_is_refused():
     with pytest.raises(ValueError, match='capacity 0'):
         EpisodeReplay(0, 3, 5, 2, 4)

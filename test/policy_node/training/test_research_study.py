@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 from policy_node.policies.files import write_file
 from policy_node.training.configuration.flat import to_flat
@@ -42,8 +41,6 @@ from policy_node.training.studies.study import Job, Study, to_settings
 from support import ROOT
 from support.full_disk import files_at_most
 from support.runs import one_line
-
-torch.set_num_threads(1)
 
 SMALL = ['--study', 'unbiased', '--seeds', '0', '--steps', '800', '--episodes', '4']
 SMALL += ['--set', 'num_envs=4', '--set', 'updates_per_cycle=2', '--set', 'evaluation_episodes=4']

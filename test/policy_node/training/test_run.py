@@ -55,31 +55,8 @@ class StopAfter:
             self.trainer.stop('interrupted')
 
 
-def train_in_parts(output, cycles, **fields):
-    """Interrupts a run after every so many cycles and resumes it until it is done."""
-    rows, reason = [], 'interrupted'
-    while reason == 'interrupted':
-        start = resumed if (output / STATE).exists() else trainer_of
-        trainer = start(output, evaluate_every=1_000, **fields)
-        log = StopAfter(trainer, cycles)
-        reason = trainer.train(log)
-        rows += log.rows
-    return rows
-
-
 def counters_of(run):
     return json.loads(read_tensors(run / STATE)[1]['counters'])
-
-
-@pytest.mark.release
-def test_a_run_interrupted_ten_times_learns_as_much_as_one_that_was_not(tmp_path):
-    whole = train_in_parts(tmp_path / 'whole', 1000, total_steps=4_400)
-    parts = train_in_parts(tmp_path / 'parts', 1, total_steps=4_400)
-    for name in ('env_steps', 'updates', 'episodes'):
-        assert [row[name] for row in parts] == [row[name] for row in whole]
-    assert parts[-1]['updates'] == 11 * 4
-    evaluated = [row['env_steps'] for row in parts if row.get('eval_success') is not None]
-    assert len(evaluated) >= 3, 'although no part is as long as the time between evaluations'
 
 
 def test_a_run_without_its_replay_fills_it_up_before_it_goes_on(tmp_path, capsys):

@@ -23,8 +23,6 @@ from policy_node.training.research.judged import (
 )
 from policy_node.training.research.registry import make_ddpg, make_sampler
 
-torch.set_num_threads(1)
-
 TICKS = 6
 REAL = {'real': 1.0}
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import json
 import os
-import shutil
 
 import pytest
 
@@ -13,22 +12,10 @@ from policy_node.policies.files import read_tensors, write_tensors
 from policy_node.training.configuration.recipes import recipe_config
 from policy_node.training.runs.run import Caller, train_run
 from policy_node.training.ship_actor import main
-from support.runs import SMALL, one_line, small
+from support.runs import SMALL, one_line
 
 NAMES = ('FetchReach', 'FetchReach_robust')
 TEXT = '{"success_gymnasium": 0.5, "mean_return": -1, "episodes": "9"}'
-
-
-@pytest.fixture(scope='module')
-def finished(tmp_path_factory):
-    folder = tmp_path_factory.mktemp('shipped') / 'run'
-    train_run(small(total_steps=800), folder, caller=Caller(quiet=True))
-    return folder
-
-
-@pytest.fixture
-def run(finished, tmp_path):
-    return shutil.copytree(finished, tmp_path / 'run')
 
 
 def ship(run, actors, episodes):
@@ -55,9 +42,7 @@ def test_an_evaluation_of_fewer_episodes_replaces_no_actor(run, tmp_path, capsys
     assert files_in(actors) == before
 
 
-@pytest.mark.parametrize(
-    'content', ['{', '[]', '{"episodes": 1}', '{"success_gymnasium": "x"}', TEXT]
-)
+@pytest.mark.parametrize('content', ['{', '{"episodes": 1}', TEXT])
 def test_an_invalid_evaluation_is_one_line(run, tmp_path, content, capsys):
     actors = tmp_path / 'actors'
     actors.mkdir()

@@ -24,7 +24,6 @@ from support import runs, script_environment
 for _library in ('matplotlib', 'tensorboard'):
     pytest.importorskip(_library)
 from policy_node.training import Run, train  # noqa: E402
-from policy_node.training.train_her import main  # noqa: E402
 
 SMALL = runs.SMALL | {'quiet': True}
 
@@ -84,19 +83,6 @@ def test_the_record_contains_all_arguments_of_each_part(tmp_path):
     ]
 
 
-def test_the_function_trains_as_the_command(tmp_path):
-    """Bit for bit."""
-    run = train('FetchReach', tmp_path / 'function', total_steps=800, overlap=False, **SMALL)
-    fields = runs.options_of(**runs.SMALL, overlap=False, total_steps=800)
-    assert main(['--task=FetchReach', *fields, f'--output={tmp_path / "command"}']) == 0
-    zeros = {'observation': np.zeros(10), 'achieved_goal': np.zeros(3), 'desired_goal': np.ones(3)}
-    ours, theirs = (
-        load_policy(folder / 'latest.safetensors').policy.predict(zeros)[0]
-        for folder in (run.folder, tmp_path / 'command')
-    )
-    assert ours.tolist() == theirs.tolist()
-
-
 def test_a_callback_sees_every_cycle_and_may_end_the_run(tmp_path):
     rows = []
 
@@ -139,11 +125,8 @@ def test_a_second_interrupt_does_not_wait_for_a_collection():
     ('arguments', 'said'),
     [
         ({'task': 'FetchRech'}, "did you mean 'FetchReach'"),
-        ({'task': ['FetchReach']}, "unknown task \\['FetchReach'\\]; allowed: FetchReach"),
         ({'on_cycle': 3}, 'on_cycle 3; allowed: None or a function'),
         ({'output': 0}, 'output 0; allowed: the path of a folder, or None'),
-        ({'output': ''}, "output ''; allowed"),
-        ({'recipe': ''}, "recipe ''; allowed: paper"),
         ({'resume': 'no'}, "resume 'no'; allowed: True or False"),
         ({'resume': True}, 'is not the folder of a run'),
         ({'resume': True, 'output': None}, 'resume=True needs output'),
@@ -161,10 +144,6 @@ def test_a_folder_that_holds_a_run_is_left_alone(tmp_path):
     before = (tmp_path / 'training_state.safetensors').read_bytes()
     with pytest.raises(ValueError, match='resume=True'):
         train('FetchReach', tmp_path, total_steps=400, **SMALL)
-    with pytest.raises(ValueError, match='FetchReach, not of FetchPush'):
-        train('FetchPush', tmp_path, resume=True, quiet=True)
-    with pytest.raises(ValueError, match="init_from ''"):
-        train('FetchReach', tmp_path, resume=True, init_from='FetchReach', quiet=True)
     assert (tmp_path / 'training_state.safetensors').read_bytes() == before
 
 
