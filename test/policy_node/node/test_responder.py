@@ -20,7 +20,6 @@ from policy_node.node.health import Health, Pace, read_pace
 from policy_node.node.responder import Responder, StampJoin
 from policy_node.policies.loading import load_policy
 from policy_node.policies.policy import LoadedPolicy
-from support.hostile_messages import hostile_bytes
 
 REACH = task_spec('FetchReach')
 
@@ -143,11 +142,19 @@ def test_invalid_state_is_refused_and_the_next_tick_answered(case):
 def test_hostile_bytes_are_refused_in_one_line_and_counted(case, hostile_count):
     responder, wire, ticks = case
     generator = np.random.default_rng(3)
+    names = [source.name for source in responder.topics]
     refused = 0
     for _ in range(hostile_count):
-        source = responder.topics[generator.integers(len(responder.topics))]
+        name = names[generator.integers(len(names))]
+        data = bytearray(ticks[generator.integers(len(ticks))][name])
+        for _ in range(generator.integers(0, 6)):
+            data[generator.integers(len(data))] = generator.integers(256)
+        if generator.random() < 0.2:
+            data = data[: generator.integers(len(data))]
+        elif generator.random() < 0.1:
+            data += bytes(generator.integers(0, 256, generator.integers(1, 2000)).tolist())
         try:
-            responder.receive(source.name, hostile_bytes(generator, source))
+            responder.receive(name, bytes(data))
             responder.answer()
         except ValueError as error:
             refused += 1
