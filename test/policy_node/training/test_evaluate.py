@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import csv
 import json
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -11,7 +13,6 @@ import pytest
 from fetch_hand_sim.simulation import Simulation
 from policy_node.policies.policy import RandomPolicy, RestingPolicy
 from policy_node.training.evaluate_policy import main
-from policy_node.training.evaluate_reference import main as evaluate_reference
 from policy_node.training.evaluation import (
     EpisodeOutcomes,
     compare,
@@ -261,10 +262,16 @@ def test_ctrl_c_reports_the_episodes_that_are_finished(capsys, monkeypatch):
     assert json.loads(capsys.readouterr().out)['episodes'] == 3
 
 
-def test_an_invalid_report_is_rejected_before_the_evaluation(tmp_path, capsys):
+def test_an_invalid_report_is_rejected_before_the_evaluation(tmp_path):
     (tmp_path / 'list.json').write_text('[1]')
     (tmp_path / 'folder.json').mkdir()
-    for name, line in (('list', 'contains no JSON object'), ('folder', 'cannot be written: ')):
-        report = str(tmp_path / f'{name}.json')
-        assert evaluate_reference(['--policy', 'FetchReach', '--json', report]) == 2
-        assert line in one_line(capsys)
+    code = f"""
+from policy_node.training.evaluate_reference import main
+for name in ('list', 'folder'):
+    print(main(['--policy', 'FetchReach', '--json', f'{tmp_path}/{{name}}.json']))
+"""
+    command = [sys.executable, '-O', '-c', code]
+    found = subprocess.run(command, capture_output=True, text=True, check=True, timeout=120)
+    assert found.stdout == '2\n2\n'
+    listed, folder = found.stderr.splitlines()
+    assert 'contains no JSON object' in listed and 'cannot be written: ' in folder
