@@ -36,23 +36,6 @@ def test_hash_is_the_one_ros_installed(type_name):
     }
 
 
-@pytest.mark.parametrize('type_name', TYPES)
-def test_schema_text_holds_every_type_ros_names(type_name):
-    description = installed_type(type_name)['type_description_msg']
-    types = [description['type_description'], *description['referenced_type_descriptions']]
-    sections = schema_text(type_name).split('=' * 80 + '\n')
-    headed = [f'MSG: {type_name.replace("/msg/", "/")}\n{sections[0]}', *sections[1:]]
-    found = {}
-    for section in headed:
-        title, *lines = section.strip('\n').split('\n')
-        fields = [line.split() for line in lines if '=' not in line]
-        found[title.removeprefix('MSG: ')] = [name for _, name in fields]
-    assert found == {
-        entry['type_name'].replace('/msg/', '/'): [field['name'] for field in entry['fields']]
-        for entry in types
-    }
-
-
 def test_an_unknown_type_is_rejected_by_name():
     with pytest.raises(ValueError, match=r"unknown message type 'nav/Goal'; allowed: .*Jazzy"):
         schema_text('nav/Goal')

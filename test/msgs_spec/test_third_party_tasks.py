@@ -83,6 +83,8 @@ def test_a_task_is_simulated_by_the_package_that_it_is_of(
     tasks.third_party_tasks()
     assert tasks.third_party_simulation('Pushed') == 'the class'
     assert tasks.third_party_simulation('Alone') == 'another class'
+    with pytest.raises(ValueError, match='task Gone has no simulation: no installed package'):
+        tasks.third_party_simulation('Gone')
 
 
 @pytest.mark.parametrize(

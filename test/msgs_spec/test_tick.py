@@ -9,25 +9,18 @@ import pytest
 
 from msgs_spec.codecs import decode, decode_status, message_stamp
 from msgs_spec.schemas import deserialize, serialize
-from msgs_spec.tasks import TASKS, GoalKind
+from msgs_spec.tasks import TASKS
 from msgs_spec.tick import EpisodeStatus, TickEncoder, join_messages, split_messages
 from msgs_spec.topics import LATEST_TICK, topic, topics
-from support.random_ticks import STAMP, episode_status, random_tick
+from support.random_ticks import STAMP, episode_status, random_tick, sensed_topics
 
 every_task = pytest.mark.parametrize('task', TASKS.values(), ids=TASKS)
 
-FETCH_TOPICS = ['/clock', 'joint_states', 'end_effector_pose', 'end_effector_twist']
-HAND_TOPICS = ['/clock', 'joint_states', 'fingertip_poses']
-OBJECT_TOPICS = ['object_pose', 'object_twist']
 RESULT_TOPICS = ['desired_goal', 'achieved_goal', 'reward', 'is_success', 'applied_command']
 
 
 def expected_order(task):
-    if task.robot.name == 'fetch':
-        return [*FETCH_TOPICS, *(OBJECT_TOPICS if task.has_object else []), *RESULT_TOPICS]
-    if task.goal is GoalKind.FINGERTIPS:
-        return [*HAND_TOPICS, *RESULT_TOPICS]
-    return [*HAND_TOPICS, *OBJECT_TOPICS, 'object_joint', *RESULT_TOPICS]
+    return ['/clock', *sensed_topics(task), *RESULT_TOPICS]
 
 
 @every_task

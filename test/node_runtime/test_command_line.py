@@ -17,7 +17,6 @@ from node_runtime.command_line import (
     require_extra,
     run_command,
     say,
-    start_command,
     whole_number,
 )
 from support import script_environment
@@ -182,14 +181,6 @@ def test_missing_packages_are_named_with_the_remedy(monkeypatch):
     monkeypatch.setitem(sys.modules, 'rclpy', None)
     with pytest.raises(UsageError, match=r'source a ROS 2 Jazzy installation or pip install'):
         require_extra('ros')
-
-
-def test_a_command_does_not_begin_without_its_extra(monkeypatch, capsys):
-    monkeypatch.setitem(sys.modules, 'torch', None)
-    assert start_command('tool', 'no.such.module', 'actors') == 2
-    assert capsys.readouterr().err == (
-        "tool: torch missing: pip install 'fetch_hand_sim[actors]'\n"
-    )
 
 
 # Progress

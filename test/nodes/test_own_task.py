@@ -208,31 +208,3 @@ def test_it_is_trained_run_by_the_nodes_logged_checked_and_replayed(
     code, output = finish(start_process(*replay, *arguments, env=os_environment), timeout=60.0)
     assert code == 0, output
     end(policy)
-
-
-def test_a_broken_package_costs_one_warning_and_its_own_task(tmp_path: Path) -> None:
-    (tmp_path / 'broken_task.py').write_text("raise RuntimeError('no such\\nrobot')\n")
-    entry = '[fetch_hand_sim_tasks.specification]\nMine = broken_task:Mine\n'
-    install(tmp_path, 'broken-task', entry)
-    code = 'import fetch_hand_sim; from msgs_spec.tasks import TASKS; print(len(TASKS))'
-    result = run(tmp_path, '-c', code)
-    assert result.stdout == '13\n'
-    (line,) = result.stderr.splitlines()
-    assert line == 'task Mine is left out: broken-task: broken_task:Mine: no such robot'
-
-
-def test_a_task_without_a_simulation_says_so(site: Path, tmp_path: Path) -> None:
-    subprocess.run(['cp', '-r', f'{site}/.', tmp_path], check=True)
-    (entries,) = tmp_path.glob('*.dist-info/entry_points.txt')
-    text = entries.read_text()
-    assert '[fetch_hand_sim_tasks.simulation]' in text
-    entries.write_text(text.replace('[fetch_hand_sim_tasks.simulation]', '[something.else]'))
-    command = (
-        'from fetch_hand_sim.simulation import Simulation\n'
-        'try: Simulation("FetchReachOriented")\n'
-        'except ValueError as error: print(error)\n'
-    )
-    result = run(tmp_path, '-c', command)
-    assert result.stdout.startswith(f'task {TASK} has no simulation: no installed package'), (
-        result.stderr
-    )

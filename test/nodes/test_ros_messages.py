@@ -214,21 +214,6 @@ def test_simulation_interfaces_answer_as_their_definitions_say(start_process: St
     end(node)
 
 
-def test_steps_beyond_the_last_episode_are_counted(start_process: Start) -> None:
-    needs('simulation_interfaces')
-    # The first reset needs no command; no command follows.
-    node = start_process(*SIM_NODE, *ros_args(task='FetchReach', mode='lockstep', episodes=2))
-    with client(task_spec('FetchReach')) as connection:
-        simulator = Simulator(connection)
-        assert simulator.set_state(2)[0] == 1
-        connection.spin(0.5)
-        assert simulator.result('step_simulation', steps=200) == (
-            4,
-            'all episodes are done; 101 of 200 ticks ran',
-        )
-    assert node.wait(20) == 0
-
-
 @pytest.mark.parametrize('mode', ['realtime', 'lockstep'])
 def test_a_policy_goes_on_after_others_paused_and_stepped(start_process: Start, mode: str) -> None:
     messages = needs('simulation_interfaces')

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import PIL.Image
 import pytest
-from std_srvs.srv import SetBool, Trigger
+from std_srvs.srv import SetBool
 
 from fetch_hand_sim.episode_log import EpisodeDirectory
 from fetch_hand_sim.simulation.opengl import prepare_opengl
@@ -35,8 +35,7 @@ from fetch_hand_sim.view.requests import (
 )
 from msgs_spec.codecs import decode, message_stamp
 from msgs_spec.tasks import task_spec
-from msgs_spec.topics import scalar_topics, topic, topics
-from node_runtime.ros import subscribe
+from msgs_spec.topics import topic
 from support import running_processes, stat_of
 from support.episode_recorder import Recorder
 from support.graph import (
@@ -199,14 +198,17 @@ def test_a_page_commands_until_a_policy_does_and_then_chooses_its_actor(
         follower.until(has_changed, 'random commands')
 
 
-def test_a_replay_is_told_from_a_robot_and_paused(start_process: Start, tmp_path: Path) -> None:
+def test_a_replay_of_any_name_is_told_from_a_robot_and_paused(
+    start_process: Start, tmp_path: Path
+) -> None:
     path = Recorder('FetchReach').record(EpisodeDirectory(tmp_path))
-    start_process(*VIEW_REPLAY, *ros_args(path=path, loop=True, rate=0.8))
-    with client(REACH) as connection:
+    renamed = ['-r', '__node:=player', '-r', '__ns:=/left', '-r', '~/pause:=/left/halt']
+    start_process(*VIEW_REPLAY, *ros_args(path=path, loop=True, rate=0.8), *renamed)
+    with client(REACH, namespace='left') as connection:
         follower = Follower(connection)
         follower.until(lambda p: p.facts.rate > 1.0 and p.facts.phase == 'running', 'replay')
         facts = follower.picture.facts
-        assert facts.commander == 'a replay (/replay_node)'
+        assert facts.commander == 'a replay (/left/player)'
         assert not facts.takes_actions
         follower.until(lambda p: p.facts.speed == 0.8, 'its rate')
         follower.robot.perform(SetSpeed(0.001))
@@ -230,27 +232,8 @@ def test_a_replay_is_told_from_a_robot_and_paused(start_process: Start, tmp_path
         follower.until(lambda p: True, 'picture')
         assert follower.picture.stamp_ns == stamp and follower.picture.facts.is_paused
         # Another program lets it go on.
-        assert connection.call(SetBool, '/replay_node/pause', data=False).success
+        assert connection.call(SetBool, '/left/halt', data=False).success
         follower.until(lambda p: not p.facts.is_paused and p.stamp_ns != stamp, 'it goes on')
-
-
-@pytest.mark.release
-def test_a_replay_of_any_name_in_any_namespace_is_paused(
-    start_process: Start, tmp_path: Path
-) -> None:
-    path = Recorder('FetchReach').record(EpisodeDirectory(tmp_path))
-    names = {each.name for each in topics(REACH) if each.direction == 'published'} - {'/clock'}
-    names_in_left = [word for name in names for word in ('-r', f'/{name}:=/left/{name}')]
-    renamed = ['-r', '__node:=player', '-r', '__ns:=/left', '-r', '~/pause:=/left/halt']
-    start_process(*VIEW_REPLAY, *ros_args(path=path, loop=True), *names_in_left, *renamed)
-    with client(REACH, namespace='left') as connection:
-        follower = Follower(connection)
-        name = 'a replay (/left/player)'
-        follower.until(lambda p: p.facts.commander == name and p.facts.rate > 1.0, 'replay')
-        follower.robot.perform(SetPaused(True))
-        follower.until(lambda p: p.facts.is_paused, 'pause')
-        follower.robot.perform(SetPaused(False))
-        follower.until(lambda p: not p.facts.is_paused and p.facts.notice == 'running', 'end of it')
 
 
 def open_view(start_process: Start) -> tuple[subprocess.Popen[str], str]:
@@ -372,7 +355,8 @@ def test_standard_tools_get_what_they_need_also_from_a_robot_that_stands_still(
     node = start_process(*VISUALIZATION, *parameters, *other)
     with client(REACH) as connection:
         received = connection.received
-        connection.subscribe('achieved_goal', 'robot_description', 'goal_markers')
+        goals = 'achieved_goal', 'desired_goal'
+        connection.subscribe(*goals, 'robot_description', 'goal_markers')
         # Without tf2_msgs, which PyPI lacks, the node has no topic of frames.
         names = ['goal_markers', 'scalars/distance', *(['/tf'] if find_spec('tf2_msgs') else [])]
         connection.subscribe('scalars/distance')
@@ -404,9 +388,12 @@ def test_standard_tools_get_what_they_need_also_from_a_robot_that_stands_still(
         last = connection.stamps('achieved_goal')[-1:]
         # Pictures are fewer than ticks, but the last one shows the last tick.
         connection.spin_until(
-            lambda: all(connection.stamps(n)[-1:] == last for n in names if n != '/tf'),
+            lambda: all(connection.stamps(n)[-1:] == last for n in (*goals, *names) if n != '/tf'),
             'last picture',
         )
+        values = [decode(topic(REACH, name), received[name][-1]) for name in goals]
+        distance = received['scalars/distance'][-1].vector.x
+        assert distance == GoalMetric(REACH).distances(*values)[0]
         late = Client(REACH, 'late')
         late.subscribe(*names)
         late.spin_until(lambda: all(late.stamps(name) == last for name in names), 'last tick again')
@@ -427,13 +414,9 @@ def test_standard_tools_get_what_they_need_also_from_a_robot_that_stands_still(
     end(node)
 
 
-@pytest.mark.release
-@pytest.mark.parametrize('simulated_time', [False, True])
-def test_another_robot_in_the_same_place_is_followed(
-    start_process: Start, simulated_time: bool
-) -> None:
+def test_another_robot_in_the_same_place_is_followed(start_process: Start) -> None:
     """Its goals come on the same topics with another type, or its joints have other names."""
-    node = start_process(*VISUALIZATION, *ros_args(use_sim_time=simulated_time))
+    node = start_process(*VISUALIZATION, *ros_args(use_sim_time=True))
     for task, names in (
         ('HandReach', {}),
         ('HandReach', {'joint_prefix': 'rh_'}),
@@ -453,41 +436,6 @@ def test_another_robot_in_the_same_place_is_followed(
             connection.spin_until(is_followed, f'scalars of {task}')
         end(robot)
     end(node)
-
-
-def test_a_viewer_sees_another_robot_in_the_same_place(start_process: Start) -> None:
-    """What the page asks for goes to the robot of now, or nowhere."""
-    asked = np.zeros(0)
-    with client(REACH, 'viewer') as connection:
-        follower = Follower(connection)
-        for task in ('HandReach', 'FetchPush'):
-            spec = task_spec(task)
-            robot = start_process(*SIM_NODE, *ros_args(task=task))
-            follower.until(
-                lambda p, size=spec.goal.size: (
-                    p.frame is not None and p.frame.desired_goal.size == size
-                ),
-                f'picture of {task}',
-            )
-            # Made for the robot before.
-            follower.robot.perform(SetGoal(asked))
-            follower.robot.perform(SetCommand(np.zeros(1)))
-            asked = follower.picture.frame.desired_goal + np.eye(1, spec.goal.size)[0] * 0.01
-            # The page shows its goal before the robot publishes it.
-            desired, published = topic(spec, 'desired_goal'), []
-            subscription = subscribe(connection.node, desired, published.append)
-
-            def has_goal(picture, spec=spec, asked=asked, desired=desired, published=published):
-                # Until the robot has found the publisher of the page, requests are lost.
-                follower.robot.perform(SetGoal(asked))
-                follower.robot.perform(SetCommanding(True))
-                follower.robot.perform(SetCommand(np.zeros(spec.robot.action_size)))
-                goals = [picture.frame.desired_goal, *(decode(desired, m) for m in published[-1:])]
-                return len(goals) == 2 and all(np.allclose(goal, asked) for goal in goals)
-
-            follower.until(has_goal, f'goal of {task}')
-            connection.node.destroy_subscription(subscription)
-            end(robot)
 
 
 @pytest.mark.alone
@@ -544,40 +492,6 @@ def test_without_opengl_the_camera_says_so_and_the_rest_goes_on(
     assert 'MUJOCO_GL=disabled; allowed: egl' in line
     (said,) = [line for line in output.splitlines() if 'FetchReach: publishes' in line]
     assert 'goal_markers' in said and 'scalars/distance' in said
-
-
-def test_scalars_are_those_of_the_tick_with_their_stamp(start_process: Start) -> None:
-    spec = task_spec('HandManipulateBlockFull')
-    metric = GoalMetric(spec)
-    sources = {each.name: each for each in scalar_topics(spec)}
-    sources |= {name: topic(spec, name) for name in ('achieved_goal', 'desired_goal')}
-    start_process(*SIM_NODE, *ros_args(task=spec.name))
-    node = start_process(*VISUALIZATION)
-    with client(spec) as connection:
-        connection.subscribe(*sources)
-
-        def whole_ticks():
-            return set.intersection(*(set(connection.stamps(name)) for name in sources))
-
-        # Subscriptions connect one after the other.
-        connection.spin_until(lambda: len(whole_ticks()) > 20, 'scalars')
-        assert connection.call(Trigger, 'sim_node/reset').success
-        connection.spin_until(lambda: len(whole_ticks()) > 40, 'scalars after a reset')
-        seen = {
-            name: {message_stamp(m): decode(source, m) for m in connection.received[name]}
-            for name, source in sources.items()
-        }
-    end(node)
-    stamps = sorted(set.intersection(*map(set, seen.values())))
-    # A tick is 40 ms, and all come; a machine that is busy may lose some of them.
-    assert len(stamps) > 0.5 * (stamps[-1] - stamps[0]) / 40e6
-    for stamp in stamps:
-        goals = seen['achieved_goal'][stamp], seen['desired_goal'][stamp]
-        expected = dict(zip(('distance', 'rotation'), metric.distances(*goals), strict=True))
-        expected |= {'reward': metric.reward(*goals), 'is_success': metric.success(*goals)}
-        for name, value in expected.items():
-            assert seen[f'scalars/{name}'][stamp][0] == value, name
-    assert set(seen['scalars/distance']) - set(seen['scalars/reward']), 'a reset has a reward'
 
 
 def niceness_of_threads(process: int) -> list[int]:

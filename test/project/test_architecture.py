@@ -6,8 +6,6 @@ import re
 from functools import cache
 from pathlib import Path
 
-import pytest
-
 from support import ROOT
 
 PACKAGES = ('msgs_spec', 'node_runtime', 'fetch_hand_sim', 'policy_node')
@@ -63,22 +61,3 @@ def test_files_named_by_pages_and_package_docstrings_exist() -> None:
     packages = [path for name in PACKAGES for path in (ROOT / name).rglob('__init__.py')]
     lost = {str(path): lost_files(path.read_text()) for path in (*pages(), *packages)}
     assert {path: files for path, files in lost.items() if files} == {}
-
-
-def test_every_page_is_in_the_documentation() -> None:
-    """Each page is in a table of contents, where readers on GitHub find it."""
-    listed: set[Path] = set()
-    for page in pages_of_docs():
-        for block in re.findall(
-            r'^```{toctree}\n(.*?)^```', page.read_text(), re.DOTALL | re.MULTILINE
-        ):
-            names = (line for line in block.splitlines() if line and not line.startswith(':'))
-            listed |= {(page.parent / f'{name}.md').resolve() for name in names}
-    docs = {*pages_of_docs()} - {ROOT / 'docs/index.md'}
-    assert docs - listed == set()
-    assert {path for path in listed - docs if path.parent.name != 'generated'} == set()
-
-
-@pytest.mark.parametrize('path', ['fetch_hand_sim/episode_check.py', 'rewards_of_old.py'])
-def test_a_file_that_moved_is_noticed(path: str) -> None:
-    assert lost_files(f'see `{path}` and `simulation/rewards.py`') == [path]

@@ -47,23 +47,6 @@ def test_the_first_evaluation_with_the_target_counts(bench_her: ModuleType) -> N
     assert ratios == [None, None], 'a failed run has no ratio'
 
 
-@pytest.mark.parametrize(
-    ('arguments', 'line'),
-    [
-        (['--limit', '0'], '--limit 0.0; allowed: above 0'),
-        (['--threads', '-1'], '--threads -1; allowed: above 0'),
-        (['--competitors', 'ppo'], "invalid choice: 'ppo'"),
-    ],
-)
-def test_bad_usage_ends_with_status_2(
-    bench_her: ModuleType, arguments: list[str], line: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with pytest.raises(SystemExit) as exit_info:
-        bench_her.main(arguments)
-    assert exit_info.value.code == 2
-    assert line in capsys.readouterr().err.splitlines()[-1]
-
-
 @pytest.mark.release
 def test_competitors_train_on_the_same_task(
     bench_her: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -123,30 +123,6 @@ def test_it_builds_with_links_to_the_sources_too(workspace, tmp_path):
     assert (tmp_path / 'install' / PACKAGE / 'lib' / PACKAGE / 'sim_node').is_file()
 
 
-def test_launch_files_name_installed_executables_and_files(prefix, executables):
-    launch_files = list((prefix / 'share' / PACKAGE / 'launch').glob('*.launch.xml'))
-    for path in launch_files:
-        text = path.read_text()
-        launched = list(ElementTree.fromstring(text).iter('node'))
-        assert {node.get('pkg') for node in launched} == {PACKAGE}
-        assert {node.get('exec') for node in launched} <= executables
-        for part in text.split(f'$(find-pkg-share {PACKAGE})/')[1:]:
-            assert (prefix / 'share' / PACKAGE / part.partition('"')[0]).is_file(), part
-    assert launch_files
-
-
-def test_python_imports_the_installed_package(workspace, prefix, in_install):
-    files = ', '.join(f'{name}.__file__' for name in PYTHON_PACKAGES)
-    code = f'import {", ".join(PYTHON_PACKAGES)}; print({files}, sep="\\n")'
-    # Not from the repository, whose folder Python would search first.
-    result = subprocess.run(
-        in_install(f"python3 -c '{code}'"), cwd=workspace, capture_output=True, text=True
-    )
-    assert result.returncode == 0, result.stderr
-    for path in result.stdout.splitlines():
-        assert Path(path).is_relative_to(prefix), path
-
-
 def test_colcon_test_runs_the_tests(workspace):
     """A requirement that colcon cannot read makes it find none, and be content with that."""
     file = 'test/msgs_spec/test_rotations.py'

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import os
 import re
 import signal
 import subprocess
@@ -237,12 +236,3 @@ def test_lines_of_a_page_are_found():
     assert list(shell_lines(page)) == ['a b  # c', 'X=1 d && e > f']
     found = [words for line in shell_lines(page) for words in commands(line)]
     assert found == [['a', 'b'], ['d'], ['e'], ['>', 'f']]
-
-
-def test_the_episode_commands_of_the_pages_work(episodes, monkeypatch, capsys):
-    monkeypatch.chdir(episodes)
-    monkeypatch.setattr(sys, 'argv', [])
-    for words in (['list', 'episodes'], ['check', 'episodes'], ['recover', 'episodes']):
-        assert fetch_hand_sim(['episodes', *words]) == 0, words
-    assert capsys.readouterr().out.count('identical, 51 ticks') == 2
-    assert os.listdir(episodes) == ['episodes']

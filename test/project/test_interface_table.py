@@ -8,7 +8,6 @@ import runpy
 from msgs_spec.parameters import NODES
 from msgs_spec.robots import SHADOW_HAND
 from msgs_spec.tasks import TASKS
-from msgs_spec.tick import PHASES
 from msgs_spec.topics import SERVICES, topics, view_topics
 from support import ROOT
 
@@ -40,20 +39,6 @@ def test_everything_has_its_row():
             )
     for spec in SERVICES:
         assert any(line.startswith(f'| `{spec.name}` |') for line in lines)
-
-
-def test_phases_and_the_limit_of_steps_are_documented():
-    text = interface_markdown()
-    assert all(f'`{phase}` {when}' in text for phase, when in PHASES.items())
-    assert 'Runs the given number of ticks, 1 ... 1000; while paused.' in text
-
-
-def test_hand_commands_are_listed_in_order_with_their_ranges():
-    rows = [line for line in interface_markdown().splitlines() if line.startswith('| hand |')]
-    assert rows == [
-        f'| hand | {i} | `{part.name[7:]}` | {part.lower:g} | {part.upper:g} | rad |'
-        for i, part in enumerate(SHADOW_HAND.command)
-    ]
 
 
 def test_section_is_replaced_and_the_rest_kept(tmp_path):

@@ -105,7 +105,7 @@ def test_launch_files_start_installed_executables():
     setup, text = ((ROOT / name).read_text() for name in ('setup.py', 'launch/demo.launch.xml'))
     for name, group in GROUPS.items():
         node = group.find('node')
-        assert node.get('name') == name
+        assert (node.get('pkg'), node.get('name')) == ('fetch_hand_sim', name)
         assert re.search(rf"'{name} = [\w.]+:main'", setup)
         assert resolved(node.get('namespace'), {}) == ''
     assert set(re.findall(r'\$\(var (\w+)\)', text)) == set(DEFAULTS)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import runpy
 from pathlib import Path
 
@@ -22,14 +21,6 @@ def test_a_page_is_up_to_date(path: Path) -> None:
     renewed = TOOL['with_section'](page, TOOL['sections']()[path])
     assert renewed == page, 'run: make tables, or python tools/task_pages.py --write'
     assert (path.parent / f'../images/tasks/{path.stem}.jpg').is_file() or path.stem == 'index'
-
-
-@pytest.mark.parametrize('task', TASKS.values(), ids=lambda task: task.name)
-def test_the_observation_is_listed_without_gaps(task) -> None:
-    rows = re.findall(r'^\| (\d+) \.\.\. (\d+) \|', TOOL['task_section'](task), re.MULTILINE)
-    indices = [(int(first), int(last)) for first, last in rows]
-    assert [first for first, _ in indices] == [0, *(last + 1 for _, last in indices[:-1])]
-    assert indices[-1][1] == task.observation_size - 1
 
 
 def test_a_newly_shipped_actor_is_all_it_takes(tmp_path: Path) -> None:

@@ -18,6 +18,7 @@ import fetch_hand_sim
 
 # Objects of their own: compared by what is in them.
 OWN = ('data', 'model', 'mujoco_renderer', 'np_random', 'spec', 'unwrapped', 'metadata')
+FIELDS = 'qpos qvel ctrl xpos site_xpos time cvel qacc qfrc_bias'.split()
 STEPS = 30
 
 
@@ -52,7 +53,11 @@ def play(name: str, reference: Any) -> dict[str, Any]:
     """Both environments through the same actions, some of them out of range."""
     ours = gymnasium.make(name).unwrapped
     generator = np.random.default_rng(0)
-    apart = {'observation': 0.0, 'reward': 0.0, 'success': 0.0, 'data': 0.0, 'batch_reward': 0.0}
+    apart = dict.fromkeys(('observation', 'reward', 'success', 'data', 'batch_reward'), 0.0)
+
+    def note(part: str, first: Any, second: Any) -> None:
+        apart[part] = max(apart[part], difference(first, second))
+
     differing_types = []
     sites = [ours.model.site(site).name for site in range(ours.model.nsite)]
     counted = [not name.startswith(('target', 'finger')) for name in sites]
@@ -64,33 +69,20 @@ def play(name: str, reference: Any) -> dict[str, Any]:
         if types(first) != types(second):
             differing_types.append([types(first), types(second)])
         for key in first[0]:
-            apart['observation'] = max(
-                apart['observation'], difference(first[0][key], second[0][key])
-            )
-        apart['reward'] = max(apart['reward'], difference(first[1], second[1]))
-        successes = (first[4]['is_success'], second[4]['is_success'])
-        apart['success'] = max(apart['success'], difference(*successes))
-        for field in (
-            'qpos',
-            'qvel',
-            'ctrl',
-            'xpos',
-            'site_xpos',
-            'time',
-            'cvel',
-            'qacc',
-            'qfrc_bias',
-        ):
+            note('observation', first[0][key], second[0][key])
+        note('reward', first[1], second[1])
+        note('success', first[4]['is_success'], second[4]['is_success'])
+        for field in FIELDS:
             values = (getattr(reference.data, field), getattr(ours.data, field))
             if field == 'site_xpos':
                 # The reference moves these before a picture only.
                 values = (values[0][counted], values[1][counted])
-            apart['data'] = max(apart['data'], difference(*values))
+            note('data', *values)
     goals = np.stack([first[0]['achieved_goal']] * 3), np.stack([first[0]['desired_goal']] * 3)
     # The reference cannot give a batch of rewards for the pen.
     if 'Pen' not in name:
         rewards = reference.compute_reward(*goals, {}), ours.compute_reward(*goals, {})
-        apart['batch_reward'] = difference(*rewards)
+        note('batch_reward', *rewards)
         if rewards[0].dtype != rewards[1].dtype:
             differing_types.append([str(reward.dtype) for reward in rewards])
     return {

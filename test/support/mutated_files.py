@@ -31,7 +31,6 @@ import zstandard
 from mcap.data_stream import RecordBuilder
 from mcap.records import Chunk
 from mcap.stream_reader import StreamReader
-from mcap.writer import CompressionType, Writer
 
 from fetch_hand_sim.commands import episodes_list
 from fetch_hand_sim.episode_log import (
@@ -73,10 +72,7 @@ class Mutator:
             self.oversize_inside,
             self.drop_a_record,
             self.swap_records,
-            self.overwrite,
-            self.insert,
             self.foreign_bytes,
-            self.foreign_bag,
             self.damage_in_a_valid_chunk,
             self.bomb,
         )
@@ -125,25 +121,9 @@ class Mutator:
         parts[first], parts[second] = parts[second], parts[first]
         return MAGIC + b''.join(parts) + MAGIC
 
-    def overwrite(self) -> bytes:
-        data, start = bytearray(self.whole), self._position()
-        size = int(self.random.integers(1, 512))
-        data[start : start + size] = self.random.bytes(size)
-        return bytes(data)
-
-    def insert(self) -> bytes:
-        start = self._position()
-        return self.whole[:start] + self.random.bytes(64) + self.whole[start:]
-
     def foreign_bytes(self) -> bytes:
         body = self.random.bytes(int(self.random.integers(4096)))
         return MAGIC + body + MAGIC if self.random.random() < 0.5 else body
-
-    def foreign_bag(self) -> bytes:
-        """A valid MCAP file with the records of an episode and messages of its own."""
-        content = {'task': 'FetchReach', 'control_hz': '25', 'seed': '0', 'episode': '0'}
-        messages = [self.random.bytes(int(self.random.integers(200))) for _ in range(20)]
-        return _bag(content, messages, self.random)
 
     def damage_in_a_valid_chunk(self) -> bytes:
         """Flipped bits under a valid CRC."""
@@ -200,31 +180,6 @@ def _chunk_record(chunk: Chunk) -> bytes:
     builder = RecordBuilder()
     chunk.write(builder)
     return builder.end()
-
-
-def _bag(content: dict[str, str], messages: list[bytes], random: np.random.Generator) -> bytes:
-    with tempfile.TemporaryFile() as stream:
-        writer = Writer(stream, compression=CompressionType.LZ4)
-        writer.start(profile='ros2')
-        writer.add_metadata('episode', content)
-        writer.add_metadata('episode_result', {'complete': 'true'})
-        types = {
-            '/clock': 'rosgraph_msgs/msg/Clock',
-            '/joint_states': 'sensor_msgs/msg/JointState',
-            '/reward': 'std_msgs/msg/Float64',
-        }
-        channels = []
-        for topic, type_name in types.items():
-            schema = writer.register_schema(name=type_name, encoding='ros2msg', data=b'')
-            channels.append(
-                writer.register_channel(topic=topic, message_encoding='cdr', schema_id=schema)
-            )
-        for time_ns, data in enumerate(messages):
-            channel = channels[int(random.integers(len(channels)))]
-            writer.add_message(channel_id=channel, log_time=time_ns, publish_time=0, data=data)
-        writer.finish()
-        stream.seek(0)
-        return stream.read()
 
 
 def _list(path: Path) -> object:

@@ -25,7 +25,7 @@ from msgs_spec.topics import topic, topics
 from node_runtime.ros import ros_message_class
 from policy_node.training import generate_episodes
 from support.fresh_actor import fresh_actor
-from support.graph import POLICY_NODE, SIM_NODE, TIMEOUT, client, ros_args
+from support.graph import POLICY_NODE, SIM_NODE, client, finish, ros_args
 from support.ros_messages import from_ros
 
 REPLAY_NODE = (*SIM_NODE[:2], 'fetch_hand_sim.replay_node')
@@ -46,11 +46,6 @@ REACH = task_spec('FetchReach')
 # At half speed, a slow machine may fall 0.8 s behind, ten messages, before one is lost.
 RATE = 0.5
 ODD_NAMES = ('/a b', '/1st', '/a//b', '/ä', '/{node}', '/' + 300 * 'x')
-
-
-def finish(process, timeout=TIMEOUT):
-    output, errors = process.communicate(timeout=timeout)
-    return process.returncode, output + errors
 
 
 @pytest.fixture(scope='module')

@@ -228,14 +228,3 @@ def test_commands_are_not_missing_during_a_pause(make, health_of, mode):
     assert not case.robot.misses_commands
     case.clock.now += 1.1
     assert case.robot.misses_commands
-
-
-def test_report_counts_rejections_by_reason(make, health_of):
-    case = make()
-    case.robot.tick()
-    for bad in ([0.0] * 3, [float('nan')] * 4, [float('inf')] * 4):
-        with pytest.raises(ValueError, match='allowed: '):
-            case.robot.buffer.accept(bad)
-    values = health_of(case).report(101.0).values
-    assert values['commands rejected'] == '3'
-    assert (values['rejected: wrong size'], values['rejected: not finite']) == ('1', '2')

@@ -137,6 +137,9 @@ def test_commands_of_the_page_never_reach_the_next_robot(node, task):
     assert node.count_publishers('/commands') == 0
     subscribe(node, topic(task_spec(task), 'set_goal'), goals.append)
     page.act_until(second.tick, lambda p: p.task == task and p.facts.episode > 0)
+    # Made for a robot with another goal.
+    page.viewer.perform(SetGoal(np.zeros(15)))
+    page.act_until(second.tick, lambda p: p.facts.episode > 1)
     assert not page.picture.facts.is_commanding
     assert not goals, 'the goal was kept for the first robot'
 
