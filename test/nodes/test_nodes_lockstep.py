@@ -8,17 +8,11 @@ from pathlib import Path
 
 from std_srvs.srv import Trigger
 
-from fetch_hand_sim.episode_log import read_summary
+from fetch_hand_sim.episode_log import Episode, read_summary
 from fetch_hand_sim.episodes.checker import check_episode
-from fetch_hand_sim.episodes.command_buffer import CommandBuffer
-from fetch_hand_sim.episodes.runner import EpisodeRunner
-from fetch_hand_sim.simulation import Simulation
 from msgs_spec.codecs import message_stamp
-from msgs_spec.schemas import deserialize
-from msgs_spec.tasks import TaskSpec, task_spec
-from msgs_spec.tick import TickEncoder
-from policy_node.node.responder import Responder
-from policy_node.policies.loading import load_policy
+from msgs_spec.tasks import task_spec
+from policy_node.training import generate_episodes
 from support.graph import (
     POLICY_NODE,
     SIM_NODE,
@@ -27,7 +21,6 @@ from support.graph import (
     end,
     episodes_in,
     finish,
-    payload,
     ros_args,
 )
 
@@ -35,75 +28,56 @@ REACH = task_spec('FetchReach')
 SEED = 7
 
 
-def logged_run(start: Start, directory: Path, **parameters: object):
-    """Episodes of one run of a robot, each a dict of all message bytes."""
-    arguments = ros_args(seed=SEED, wait_for_commands=True, episode_dir=directory, **parameters)
+def logged_run(start: Start, directory: Path, **parameters: object) -> list[Episode]:
+    """The episodes of one run of a robot."""
+    settings = {'mode': 'lockstep', 'wait_for_commands': True, 'log_compiled_model': False}
+    arguments = ros_args(seed=SEED, episode_dir=directory, **settings, **parameters)
     code, output = finish(start(*SIM_NODE, *arguments), timeout=60.0)
     assert code == 0, output
-    return [payload(episode) for episode in episodes_in(directory)]
+    return episodes_in(directory)
 
 
-def batch_run(
-    spec: TaskSpec, episodes: int, disturbances: str = 'none', policy: str = ''
-) -> list[dict[str, list[bytes]]]:
-    """The same without ROS: bytes by topic for each episode."""
-    simulation = Simulation(spec.name, num_threads=1, disturbances=disturbances)
-    runner = EpisodeRunner(simulation, first_seed=SEED, episodes=episodes)
-    encoder, buffer = TickEncoder(spec), CommandBuffer(spec.robot, 0.0)
-    status = runner.waiting_status()
-    sent: list[bytes] = []
-    loaded = load_policy(policy, status.task)
-    responder = Responder(loaded, status, lambda data: sent.append(data) or True)
-    result: list[dict[str, list[bytes]]] = []
-    while not runner.is_done:
-        tick = runner.advance(buffer.take())
-        messages = encoder.encode(tick, latched=tick.status.phase != 'running')
-        if tick.status.phase == 'reset':
-            buffer.start_episode(runner.resting_command())
-            result.append({})
-        for source, data in messages:
-            result[-1].setdefault('/' + source.name.lstrip('/'), []).append(data)
-        responder.note_phase(tick.status.phase, tick.stamp_ns)
-        published = {source.name: data for source, data in messages}
-        for source in responder.topics:
-            responder.receive(source.name, published[source.name])
-        responder.answer()
-        command = deserialize('std_msgs/msg/Float64MultiArray', sent[-1])
-        buffer.accept(command.data)
-        if tick.status.phase != 'finished':
-            result[-1].setdefault('/commands', []).append(sent[-1])
-    return result
+def generated(directory: Path, episodes: int, policy: str, *options: str) -> list[Episode]:
+    """The same without ROS."""
+    arguments = ['--task', 'FetchReach', '--policy', policy, '--num-envs=1', '--threads=1']
+    numbers = [f'--episodes={episodes}', f'--first-seed={SEED}', f'--output={directory}']
+    assert generate_episodes.main([*arguments, *numbers, *options]) == 0
+    return episodes_in(directory)
 
 
-def without_times(episode) -> dict[str, list[bytes]]:
-    return {name: [data for _, _, data in messages] for name, messages in episode.items()}
-
-
-def test_bytes_are_equal_between_runs_and_without_ros(start_process: Start, tmp_path: Path) -> None:
+def test_logs_are_equal_between_runs_and_without_ros(start_process: Start, tmp_path: Path) -> None:
     # One policy for all of them: what it did before must not matter.
     policy = start_process(*POLICY_NODE)
-    first = logged_run(start_process, tmp_path / '1', mode='lockstep', episodes=2)
-    second = logged_run(start_process, tmp_path / '2', mode='lockstep', episodes=2)
-    assert first == second
-    assert [without_times(episode) for episode in first] == batch_run(REACH, 2)
-    assert first[0]['/joint_states'] != first[1]['/joint_states']
+    runs = [logged_run(start_process, tmp_path / name, episodes=2) for name in ('1', '2')]
+    runs.append(generated(tmp_path / 'batch', 2, 'FetchReach'))
     end(policy)
+    for episodes in zip(*runs, strict=True):
+        first, *others = episodes
+        for episode in others:
+            for part in ('topics', 'result', 'attachments'):
+                assert getattr(episode, part) == getattr(first, part), part
+            assert list(episode.metadata) == list(first.metadata)
+            # A commit may come between the runs.
+            same = first.metadata.keys() - {'started', 'source_revision'}
+            assert all(episode.metadata[key] == first.metadata[key] for key in same)
+    assert runs[0][0].topics['/joint_states'] != runs[0][1].topics['/joint_states']
 
 
 def test_a_disturbed_episode_is_the_same_over_ros_in_the_batch_and_in_its_check(
     start_process: Start, tmp_path: Path
 ) -> None:
     policy = start_process(*POLICY_NODE, *ros_args(policy='robust'))
-    logged = logged_run(
-        start_process, tmp_path, mode='lockstep', episodes=2, disturbances='hardware'
-    )
+    logged = logged_run(start_process, tmp_path / '1', episodes=2, disturbances='hardware')
     end(policy)
-    batch = batch_run(REACH, 2, 'hardware', 'FetchReach_robust')
-    assert [without_times(each) for each in logged] == batch
-    assert logged[0]['/ground_truth/joint_states'] != logged[0]['/joint_states']
-    for path in tmp_path.iterdir():
-        assert check_episode(path).difference is None
-        assert 'action_latency' in read_summary(path).metadata['variation']
+    batch = generated(tmp_path / '2', 2, 'FetchReach_robust', '--disturbances=hardware')
+    assert [each.topics for each in logged] == [each.topics for each in batch]
+    topics = logged[0].topics
+    assert [m.data for m in topics['/ground_truth/joint_states'].messages] != [
+        m.data for m in topics['/joint_states'].messages
+    ]
+    for episode in logged:
+        assert check_episode(episode.path).difference is None
+        assert 'action_latency' in episode.metadata['variation']
 
 
 def test_disturbances_change_between_episodes(start_process: Start, tmp_path: Path) -> None:
@@ -130,7 +104,7 @@ def test_resets_leave_a_policy_no_tick_behind(start_process: Start, tmp_path: Pa
     """A command on its way at a reset answers the state before it, and is not applied after it."""
     policy = start_process(*POLICY_NODE)
     arguments = ros_args(
-        mode='lockstep', seed=SEED, episodes=60, wait_for_commands=True, episode_dir=tmp_path
+        mode='lockstep', seed=SEED, episodes=60, wait_for_commands=True, episode_dir=tmp_path / '1'
     )
     sim = start_process(*SIM_NODE, *arguments, '-p', 'log_compiled_model:=false')
     with client(REACH) as robot:
@@ -141,14 +115,14 @@ def test_resets_leave_a_policy_no_tick_behind(start_process: Start, tmp_path: Pa
             assert robot.call(Trigger, 'sim_node/reset').success
         end(sim)
     end(policy)
-    episodes = {int(e.metadata['episode']): e for e in episodes_in(tmp_path)}
-    undisturbed = batch_run(REACH, max(episodes) + 1)
+    episodes = {int(e.metadata['episode']): e for e in episodes_in(tmp_path / '1')}
+    undisturbed = generated(tmp_path / 'batch', max(episodes) + 1, 'FetchReach')
     cut = [number for number, episode in episodes.items() if not episode.is_complete]
     assert len(cut) > 1
     for number in episodes.keys() - cut:
         for name in ('/applied_command', '/reward'):
-            messages = episodes[number].topics[name].messages
-            assert [message.data for message in messages] == undisturbed[number][name], number
+            first, second = (e[number].topics[name].messages for e in (episodes, undisturbed))
+            assert [m.data for m in first] == [m.data for m in second], number
 
 
 def test_every_command_of_a_burst_has_its_own_tick(start_process: Start) -> None:

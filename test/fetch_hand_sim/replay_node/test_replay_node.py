@@ -118,22 +118,6 @@ def test_actor_on_a_replay_repeats_the_recorded_commands(start_process, tmp_path
     assert again[:-1] == recorded
 
 
-def test_generated_episodes_equal_those_of_the_nodes(start_process, tmp_path):
-    """Same seed, same policy: every message, time and key of the two files is equal."""
-    task = 'FetchPickAndPlace'
-    node = read_episode(record(start_process, tmp_path / 'node', task, 'resting'))
-    arguments = ['--policy', 'resting', '--task', task, '--episodes', '4', '--first-seed', '3']
-    assert generate_episodes.main([*arguments, '--output', str(tmp_path / 'batch')]) == 0
-    batch = read_episode(min((tmp_path / 'batch').iterdir()))
-    assert batch.topics == node.topics
-    assert batch.result == node.result
-    assert batch.attachments == node.attachments
-    # A commit may come between the two runs.
-    same = [key for key in node.metadata if key not in ('started', 'source_revision')]
-    assert list(batch.metadata) == list(node.metadata)
-    assert [batch.metadata[key] for key in same] == [node.metadata[key] for key in same]
-
-
 @pytest.mark.alone
 def test_every_message_comes_back_as_recorded_with_its_timing(start_process, episode):
     logged = read_episode(episode)
