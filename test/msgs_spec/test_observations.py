@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from gymnasium_robotics.utils import rotations as reference
 
 from fetch_hand_sim.episodes.runner import EpisodeRunner
 from fetch_hand_sim.simulation import Simulation
@@ -44,6 +45,52 @@ def test_topics_give_the_observation_of_the_simulation(name, control_hz):
         command = command_from_action(task.robot, action)
         expected = simulation.step_commands(command[None]).observation
         tick = runner.advance(command)
+
+
+def parts_of(task, vector):
+    """The named parts of an observation vector, as the task's layout has them."""
+    ends = np.cumsum([part.size for part in task.observation])
+    pieces = np.split(vector, ends[:-1])
+    return {part.name: piece for part, piece in zip(task.observation, pieces, strict=True)}
+
+
+@pytest.mark.parametrize('task', TASKS.values(), ids=TASKS)
+def test_layout_names_what_the_vector_holds(task):
+    tick = random_tick(task)
+    readings = dict(tick.readings)
+    if task.has_object:
+        readings['object_pose'][3:] /= np.linalg.norm(readings['object_pose'][3:])
+    found = ObservationAssembler(task, 50.0).assemble(vectors_of(task, tick))['observation']
+    position, velocity, _ = np.split(readings['joint_states'], 3)
+    if not task.robot.has_gripper_command:
+        expected = {'joint_position': position, 'joint_velocity': velocity}
+        expected['fingertip_positions'] = readings['fingertip_poses'].reshape(5, 7)[:, :3].ravel()
+        if task.has_object:
+            expected['object_pose'] = readings['object_joint'][:7]
+            expected['object_velocity'] = readings['object_joint'][7:]
+    else:
+        gripper, velocity_of_gripper = (
+            readings['end_effector_pose'][:3],
+            readings['end_effector_twist'][:3],
+        )
+        expected = {
+            'end_effector_position': gripper,
+            'end_effector_velocity': 0.02 * velocity_of_gripper,
+            'gripper_state': position[-2:],
+            'gripper_velocity': 0.02 * velocity[-2:],
+        }
+        if task.has_object:
+            place, quaternion = np.split(readings['object_pose'], [3])
+            linear, angular = np.split(readings['object_twist'], 2)
+            expected |= {
+                'object_position': place,
+                'object_relative_position': place - gripper,
+                'object_rotation': reference.mat2euler(reference.quat2mat(quaternion)),
+                'object_relative_velocity': 0.02 * (linear - velocity_of_gripper),
+                'object_angular_velocity': 0.02 * angular,
+            }
+    for name, piece in parts_of(task, found).items():
+        np.testing.assert_allclose(piece, expected[name], atol=1e-14, err_msg=name)
 
 
 @pytest.mark.parametrize('task', TASKS.values(), ids=TASKS)
