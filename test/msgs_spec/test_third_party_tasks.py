@@ -58,12 +58,12 @@ def test_a_package_that_ends_the_program_costs_its_own_task(
     installed: dict[str, list[Point]], caplog: pytest.LogCaptureFixture
 ) -> None:
     installed[tasks.SPECS] += [
-        Point('leaving', 'Left', SystemExit(2)),
+        Point('leaving', 'Left', SystemExit('no such\nrobot')),
         Point('staying', 'Pushed', PUSH),
     ]
     with caplog.at_level(logging.WARNING):
         assert list(tasks.third_party_tasks()) == ['Pushed']
-    assert 'task Left is left out: leaving: leaving:Left: 2' in caplog.text
+    assert 'task Left is left out: leaving: leaving:Left: no such robot' in caplog.text
 
 
 def test_a_task_is_simulated_by_the_package_that_it_is_of(

@@ -194,7 +194,7 @@ def test_two_commanders_are_reported_and_health_is_published(start_process: Star
         robot.spin_until(lambda: '1 commands rejected' in message('/sim_node'), 'the rejection')
         assert robot.reports()[-1].level == b'\x01'
         values = robot.values()
-        assert values['rejected: wrong size'] == '1'
+        assert values['rejected: wrong size'] == values['commands rejected'] == '1'
         assert values['log'] == 'off'
         assert float(values['tick time p99 (ms)']) > 0.0
         robot.spin_until(lambda: 'commands per second' in message('/policy_node'), 'a policy')

@@ -6,7 +6,6 @@ import re
 import signal
 import subprocess
 import sys
-import time
 import xml.etree.ElementTree as ElementTree
 from contextlib import contextmanager
 from importlib.util import find_spec
@@ -442,24 +441,16 @@ def test_another_robot_in_the_same_place_is_followed(start_process: Start) -> No
 def test_a_fast_robot_is_seen_as_it_is_now_and_then_and_a_replay_after_it(
     start_process: Start, tmp_path: Path
 ) -> None:
-    """One message for all of a tick, as often as eyes need it; a replay has none of these."""
+    """A robot publishes one message for all of a tick; a replay has none of these."""
     settings = {'real_time_factor': 0.0, 'episode_dir': tmp_path, 'seed': 5}
     robot = start_process(*SIM_NODE, *ros_args(task='FetchPush', **settings))
     with client(task_spec('FetchPush')) as connection:
-        connection.subscribe('latest_tick', 'joint_states', 'achieved_goal', 'reward')
+        connection.subscribe('joint_states', 'achieved_goal')
         follower = Follower(connection)
         follower.until(lambda p: p.facts.episode > 3 and p.frame is not None, 'episodes')
         names = [name for name, _ in connection.node.get_topic_names_and_types()]
         ours = connection.node.get_subscriptions_info_by_topic('/achieved_goal')
         assert '/latest_tick' in names and len(ours) == 1, 'one of the test, none of the viewer'
-        began = time.monotonic()
-        connection.received['latest_tick'].clear()
-        connection.received['joint_states'].clear()
-        connection.spin(2.0)
-        seconds = time.monotonic() - began
-        seen, ticks = (len(connection.received[n]) for n in ('latest_tick', 'joint_states'))
-        assert 5 * seconds < seen < 36 * seconds
-        assert ticks > seen, 'a starved machine has few more'
         follower.robot.perform(SetPaused(True))
         follower.until(lambda p: p.facts.is_paused, 'pause')
         connection.spin(1.0)

@@ -41,16 +41,6 @@ def test_everything_has_its_row():
         assert any(line.startswith(f'| `{spec.name}` |') for line in lines)
 
 
-def test_section_is_replaced_and_the_rest_kept(tmp_path):
-    path = tmp_path / 'page.md'
-    path.write_text(f'# Title\n{START}\nold\n{END}\nrest\n')
-    assert main(['--write', str(path)]) == 0
-    text = path.read_text()
-    assert text == f'# Title\n{START}\n\n{interface_markdown()}\n\n{END}\nrest\n'
-    assert main(['--write', str(path)]) == 0
-    assert path.read_text() == text
-
-
 def test_the_joints_of_the_hand_have_both_numberings():
     page = (ROOT / 'docs' / 'hand_joints.md').read_text()
     commanded = [part.name for part in SHADOW_HAND.command]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fetch_hand_sim.sim_node.robot import Receivers
-from msgs_spec.codecs import TopicCodec, build_message
+from msgs_spec.codecs import TopicCodec
 from msgs_spec.schemas import MAX_MESSAGE_BYTES, message_class, serialize
 from msgs_spec.tasks import task_spec
 from msgs_spec.topics import topic, topics
@@ -125,13 +125,3 @@ def message_without_pairs():
     message = introduction('')
     message.status = []
     return message
-
-
-def test_a_goal_in_a_frame_the_robot_does_not_know_is_refused(listening):
-    message = build_message(SET_GOAL, 0, [1.3, 0.7, 0.6])
-    message.header.frame_id = 'base_link'
-    receive(listening, SET_GOAL, message)
-    assert listening.lines == [
-        "set_goal dropped: frame_id 'base_link' given; allowed: 'world' or empty"
-    ]
-    assert listening.robot.counters.goals_rejected == 1

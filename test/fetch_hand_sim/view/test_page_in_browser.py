@@ -11,10 +11,8 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from contextlib import closing, contextmanager
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from contextlib import closing
 from pathlib import Path
-from threading import Thread
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -237,42 +235,6 @@ def wait_for_moves(connection: Client, moves: list[float]) -> None:
     )
 
 
-@contextmanager
-def other_site(page: str):
-    """Serves one page to this machine; yields its port."""
-
-    class Answer(BaseHTTPRequestHandler):
-        def do_GET(self) -> None:
-            self.send_response(200)
-            self.send_header('Content-Type', 'text/html')
-            self.end_headers()
-            self.wfile.write(page.encode())
-
-        def log_message(self, *arguments: object) -> None:
-            """Says nothing."""
-
-    with ThreadingHTTPServer(('127.0.0.1', 0), Answer) as server:
-        Thread(target=server.serve_forever, daemon=True).start()
-        yield server.server_address[1]
-        server.shutdown()
-
-
-def test_the_address_may_be_a_link_in_a_chat(browser, start_process, tmp_path):
-    """Browsers keep strict cookies from what a link on another site leads to."""
-    path = Recorder('FetchReach').record(EpisodeDirectory(tmp_path))
-    address = urlsplit(address_of(start_process(*VIEW, path, '--host', '0.0.0.0')))
-    url = f'http://127.0.0.1:{address.port}/?{address.query}'
-    with other_site(f'<a href="{url}">the robot</a>') as port:
-        browser.open(f'http://localhost:{port}/')
-        browser.run("document.querySelector('a').click()")
-        end = time.monotonic() + PATIENCE
-        while browser.run('location.port + location.search') != str(address.port):
-            assert time.monotonic() < end
-            browser.wait(0.2)
-        browser.wait(1.0)
-        assert browser.run("document.querySelectorAll('canvas').length") > 0
-
-
 def test_files_are_listed_and_opened_and_the_timeline_moves_them(browser, start_process, tmp_path):
     recorder = Recorder('FetchPush')
     paths = [recorder.record(EpisodeDirectory(tmp_path)) for _ in range(8)]
@@ -351,16 +313,11 @@ def take_over(browser: Browser, robot: Client) -> tuple[float, float]:
 
 
 def switch_on(browser: Browser, robot: Client, switch: tuple[float, float]) -> None:
-    """Clicks until the page commands; a page that is still busy may miss a click."""
-    for _ in range(3):
-        browser.click(*switch)
-        end = time.monotonic() + PATIENCE / 3
-        while time.monotonic() < end:
-            robot.spin(0.1)
-            if robot.node.count_publishers('/commands') == 1:
-                return
-    keep('without commands', browser.screenshot())
-    raise AssertionError('no page that commands')
+    def is_commanding(_: np.ndarray) -> bool:
+        robot.spin(0.1)
+        return robot.node.count_publishers('/commands') == 1
+
+    click_until(browser, *switch, is_commanding, 'page that commands')
 
 
 def wait_for_no_commander(robot: Client) -> None:
