@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import signal
 import sys
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -32,6 +33,16 @@ class RecordedTick:
     stamp_ns: int
     messages: list[tuple[TopicSpec, bytes]]
     command: bytes | None
+
+
+def rested_episode(runner: EpisodeRunner) -> Iterator[tuple[Tick, list[tuple[TopicSpec, bytes]]]]:
+    """Run the next episode under resting commands; yield its ticks with their messages."""
+    encoder = TickEncoder(runner.spec)
+    while True:
+        tick = runner.advance(runner.resting_command())
+        yield tick, encoder.encode(tick, latched=tick.status.phase != 'running')
+        if runner.is_between_episodes:
+            return
 
 
 class Recorder:

@@ -25,23 +25,13 @@ import numpy as np
 from fetch_hand_sim.episodes.recorder import EpisodeRecorder, RecordingContext
 from fetch_hand_sim.episodes.runner import EpisodeRunner
 from fetch_hand_sim.simulation import Simulation
-from msgs_spec.tick import TickEncoder
+from support.episode_recorder import rested_episode
 
 PERIOD = 0.04
 FACTORS = (1.0, 50.0)
 # Number of ticks; then episode, stamp and wall time of each.
 COUNT, TICK = struct.Struct('<q'), struct.Struct('<qqd')
 MOST_TICKS = 20_000
-
-
-def episode(simulation):
-    """The ticks of one episode with their messages."""
-    runner, encoder = EpisodeRunner(simulation), TickEncoder(simulation.spec)
-    ticks = []
-    while not ticks or not runner.is_between_episodes:
-        tick = runner.advance(runner.resting_command())
-        ticks.append((tick, encoder.encode(tick, latched=tick.status.phase != 'running')))
-    return ticks
 
 
 def run(directory, context, ticks, factor, lived):
@@ -71,7 +61,8 @@ def main() -> None:
     directory, kills, longest = Path(sys.argv[1]), int(sys.argv[2]), float(sys.argv[3])
     generator = np.random.default_rng(int(sys.argv[4]))
     simulation = Simulation('FetchReach', num_threads=1)
-    context, ticks = RecordingContext(simulation), episode(simulation)
+    context = RecordingContext(simulation)
+    ticks = list(rested_episode(EpisodeRunner(simulation)))
     lived = mmap.mmap(-1, COUNT.size + TICK.size * MOST_TICKS)
     for number, factor in enumerate(np.linspace(*FACTORS, kills)):
         target = directory / f'{number:03d}'

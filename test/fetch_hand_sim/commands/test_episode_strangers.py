@@ -318,19 +318,6 @@ def test_a_name_that_leads_elsewhere_creates_nothing(finished, tmp_path, name, c
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize(
-    ('name', 'id'), [('a/b', 'a/b-v0'), ('c-v3', 'c-v3'), ('me/d-v1', 'me/d-v1')]
-)
-def test_a_dataset_keeps_the_name_it_is_given(finished, tmp_path, name, id, monkeypatch, capsys):
-    minari = pytest.importorskip('minari')
-    monkeypatch.setenv('MINARI_DATASETS_PATH', str(tmp_path))
-    arguments = [str(finished), '--to', 'minari', '--output', str(tmp_path), '--name', name]
-    assert episodes_export.main(arguments) == 0
-    assert f'Minari dataset FetchReach/{id} in' in capsys.readouterr().out
-    dataset = minari.load_dataset(f'FetchReach/{id}')
-    assert dataset.spec.dataset_id == f'FetchReach/{id}' and dataset.total_steps == 50
-
-
 def test_an_episode_without_a_step_is_left_out_of_a_dataset_by_name(tmp_path, capsys):
     """Such as the episode of a robot in lockstep without commands."""
     pytest.importorskip('minari')

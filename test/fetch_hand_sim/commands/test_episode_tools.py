@@ -37,7 +37,7 @@ from msgs_spec.topics import topic
 from policy_node.policies.policy import RandomPolicy
 from policy_node.training import generate_episodes
 from policy_node.training.experience.episode_files import read_experience
-from support.episode_recorder import Recorder
+from support.episode_recorder import Recorder, rested_episode
 
 # One of each kind of goal and robot.
 FAMILIES = ('FetchReach', 'FetchPickAndPlace', 'HandReach', 'HandManipulatePenFull')
@@ -88,6 +88,13 @@ def rewrite(source, directory, change=lambda tick, name, data: data, result=None
     if last is None:
         return writer.finish({**kept, **(result or {})})
     return writer.finish({'steps': str(last - 1)}, 'test')
+
+
+def finish_short(writer, result, reason=None):
+    """Finish an episode of a single message."""
+    spec = topic(task_spec('FetchReach'), '/clock')
+    writer.write_tick(1, [(spec, TopicCodec(spec).encode(0, []))])
+    return writer.finish(result, reason)
 
 
 # fetch_hand_sim episodes generate and fetch_hand_sim episodes check
@@ -195,10 +202,8 @@ def test_check_runs_goals_that_were_set_on_the_way(tmp_path):
     encoder = TopicCodec(goal_topic)
     directory = EpisodeDirectory(tmp_path)
     writer = directory.begin(recorder.spec.name, 0, recorder.metadata())
-    command = recorder.runner.resting_command()
-    for number in range(recorder.spec.episode_ticks + 1):
-        tick = recorder.runner.advance(command)
-        writer.write_tick(tick.stamp_ns, recorder.encode(tick))
+    for number, (tick, messages) in enumerate(rested_episode(recorder.runner)):
+        writer.write_tick(tick.stamp_ns, messages)
         if number == 30:
             # Neither of unit length nor in the hemisphere of the object.
             goal = np.array([1.0, 0.87, 0.2, -0.5, 0.5, 0.5, 0.2])
@@ -357,24 +362,20 @@ def test_tasks_of_long_names_are_read_as_they_were_written(monkeypatch):
 
 def test_list_filters(reach, tmp_path, capsys):
     directory = copy_of(reach, tmp_path)
-    for number, task in enumerate(('FetchPush', 'FetchReach')):
-        writer = EpisodeWriter(directory, f'x{number}', {'task': task, 'seed': '1'})
-        spec = topic(task_spec(task), '/clock')
-        writer.write_tick(1, [(spec, TopicCodec(spec).encode(0, []))])
-        if number:
-            writer.finish({'success': 'false'}, 'the reason')
-        else:
-            writer.finish({'success': 'true', 'steps': '1', 'return': '-1.0'})
+    for name, task, result, reason in (
+        ('x0', 'FetchPush', {'success': 'true', 'steps': '1', 'return': '-1.0'}, None),
+        ('x1', 'FetchReach', {'success': 'false'}, 'the reason'),
+        # Killed and recovered: its success is unknown.
+        ('x2', 'HandReach', {}, 'killed'),
+    ):
+        writer = EpisodeWriter(directory, name, {'task': task, 'seed': '1'})
+        finish_short(writer, result, reason)
 
     def names(*options):
         assert episodes_list.main([str(directory), *options]) == 0
         table = capsys.readouterr().out.splitlines()[1:-1]
         return [line.split()[0] for line in table]
 
-    # Killed and recovered: its success is unknown.
-    writer = EpisodeWriter(directory, 'x2', {'task': 'HandReach', 'seed': '1'})
-    writer.write_tick(1, [(spec, TopicCodec(spec).encode(0, []))])
-    writer.finish({}, 'killed')
     assert names('--task', 'HandReach') == ['x2']
     assert not names('--task', 'HandReach', '--failure')
     assert not names('--task', 'HandReach', '--success')
@@ -408,9 +409,7 @@ def test_list_names_and_skips_unreadable_files(reach, tmp_path, capsys):
 
 def test_list_shows_no_control_characters_of_a_file(tmp_path, capsys):
     writer = EpisodeWriter(tmp_path, 'x', {'task': '\x1b]0;owned\x07[red]1[/red]', 'seed': '\x1b'})
-    spec = topic(task_spec('FetchReach'), '/clock')
-    writer.write_tick(1, [(spec, TopicCodec(spec).encode(0, []))])
-    writer.finish({'success': '\x9b', 'return': 'nan', 'steps': '\n'})
+    finish_short(writer, {'success': '\x9b', 'return': 'nan', 'steps': '\n'})
     assert episodes_list.main([str(tmp_path)]) == 0
     output = capsys.readouterr().out
     assert '[red]1[/red]' in output
@@ -421,9 +420,7 @@ def test_long_values_of_one_file_are_shortened(reach, tmp_path, capsys):
     directory = copy_of(reach, tmp_path)
     metadata = read_episode(min(reach.iterdir())).metadata
     writer = EpisodeWriter(directory, 'x', {**metadata, 'seed': '1' * 400, 'task': 'y' * 400})
-    spec = topic(task_spec('FetchReach'), '/clock')
-    writer.write_tick(1, [(spec, TopicCodec(spec).encode(0, []))])
-    writer.finish({'complete': 'false', 'reason': 'z' * 400})
+    finish_short(writer, {'complete': 'false', 'reason': 'z' * 400})
     assert episodes_list.main([str(directory)]) == 0
     lines = capsys.readouterr().out.splitlines()
     names = {path.name for path in reach.iterdir()}
@@ -555,10 +552,8 @@ def test_loaded_episodes_have_paths_and_paths_may_be_text(reach, tmp_path):
     assert find_leftovers(str(reach)) == []
     with pytest.raises(EpisodeLogError, match='is no unfinished episode'):
         recover_episode(str(reach))
-    spec = topic(task_spec('FetchReach'), '/clock')
     for writer in (
         EpisodeDirectory(str(tmp_path)).begin('FetchReach', 0, {}),
         EpisodeWriter(str(tmp_path), 'mine', {}),
     ):
-        writer.write_tick(1, [(spec, TopicCodec(spec).encode(0, []))])
-        assert writer.finish({}).parent == tmp_path
+        assert finish_short(writer, {}).parent == tmp_path

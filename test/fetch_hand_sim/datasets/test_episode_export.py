@@ -235,6 +235,7 @@ def test_of_a_folder_only_what_is_asked_for_is_exported(episodes, tmp_path, monk
     monkeypatch.setenv('MINARI_DATASETS_PATH', str(tmp_path / 'minari'))
     for name, complete in (('all', [True, True, False]), ('whole', [True, True])):
         dataset = minari.load_dataset(f'{TASK}/{name}-v0')
+        assert dataset.spec.dataset_id == f'{TASK}/{name}-v0'
         told = dataset.storage.get_episode_metadata(dataset.episode_indices)
         assert [each['complete'] for each in told] == complete
         assert dataset.storage.metadata['dataset_size'] == dataset.storage.get_size()

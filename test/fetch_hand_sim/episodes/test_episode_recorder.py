@@ -26,8 +26,10 @@ from fetch_hand_sim.episodes.runner import EpisodeRunner
 from fetch_hand_sim.simulation import Simulation
 from msgs_spec.codecs import TopicCodec
 from msgs_spec.tasks import TASKS
-from msgs_spec.tick import Tick, TickEncoder
+from msgs_spec.tick import Tick
 from msgs_spec.topics import TopicSpec, topic
+from support import wait_until
+from support.episode_recorder import rested_episode
 
 METADATA = {'task': 'FetchReach'}
 COMMANDS = topic(TASKS['FetchReach'], 'commands')
@@ -39,13 +41,7 @@ Ticks = list[tuple[Tick, list[tuple[TopicSpec, bytes]]]]
 @pytest.fixture(scope='module')
 def ticks() -> Ticks:
     """One episode."""
-    simulation = Simulation('FetchReach', num_threads=1)
-    runner, encoder = EpisodeRunner(simulation), TickEncoder(simulation.spec)
-    recorded: Ticks = []
-    while not recorded or not runner.is_between_episodes:
-        tick = runner.advance(runner.resting_command())
-        recorded.append((tick, encoder.encode(tick, latched=tick.status.phase != 'running')))
-    return recorded
+    return list(rested_episode(EpisodeRunner(Simulation('FetchReach', num_threads=1))))
 
 
 def recorder_into(
@@ -233,10 +229,7 @@ def test_what_a_paused_robot_receives_reaches_the_system_without_another_tick(
     recorder.record(*ticks[0])
     for _ in range(3):
         recorder.record_received(COMMANDS, COMMAND)
-    deadline = time.monotonic() + 10.0
-    while not [chunk for path in tmp_path.glob('.*/*.mcap') for chunk in chunks(path)]:
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
+    wait_until(lambda: any(map(chunks, tmp_path.glob('.*/*.mcap'))), 'whole chunk')
     recorder.close('end')
     (path,) = tmp_path.iterdir()
     assert len(read_episode(path).topics['/commands'].messages) == 3
@@ -265,7 +258,7 @@ def test_a_recorder_that_has_failed_idles(
     recorder = recorder_into(tmp_path, errors.append)
     for tick in (*ticks, ticks[0]):
         recorder.record(*tick)
-    until(lambda: bool(errors))
+    wait_until(lambda: errors, 'error')
     recorder._tasks.put((time.monotonic(), lambda: None))
     began = time.process_time()
     time.sleep(0.5)
@@ -299,10 +292,3 @@ def test_a_disk_that_has_failed_holds_the_end_up_no_longer_than_said(
     assert time.monotonic() - began < 2.0
     gone_on.set()
     assert stored.wait(10.0)
-
-
-def until(is_true: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + 10.0
-    while not is_true():
-        assert time.monotonic() < deadline
-        time.sleep(0.01)

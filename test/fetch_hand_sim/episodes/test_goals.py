@@ -15,9 +15,8 @@ from fetch_hand_sim.simulation import Simulation
 from msgs_spec.codecs import build_message
 from msgs_spec.schemas import serialize
 from msgs_spec.tasks import task_spec
-from msgs_spec.tick import TickEncoder
 from msgs_spec.topics import topic
-from support.episode_recorder import Recorder
+from support.episode_recorder import Recorder, rested_episode
 
 SECOND = 10**9
 GOAL = [1.3, 0.7, 0.6]
@@ -85,7 +84,6 @@ def record_with_goals(tmp_path, interface_version=None):
     if interface_version == 1:
         del metadata['interface_version']
     runner = recorder.runner
-    encoder = TickEncoder(recorder.spec)
     writer = EpisodeDirectory(tmp_path).begin('FetchReach', 0, metadata)
     goals = {
         5: goal_message([1.0, 1e9, 0.5]),
@@ -95,12 +93,9 @@ def record_with_goals(tmp_path, interface_version=None):
         25: goal_message([np.inf, 0.8, 0.5]),
         30: goal_message([1.3, 0.6, 0.5]),
     }
-    command = runner.resting_command()
     taken = 0
-    for number in range(recorder.spec.episode_ticks + 1):
-        tick = runner.advance(command)
-        latched = tick.status.phase != 'running'
-        writer.write_tick(tick.stamp_ns, encoder.encode(tick, latched=latched))
+    for number, (tick, messages) in enumerate(rested_episode(runner)):
+        writer.write_tick(tick.stamp_ns, messages)
         if number in goals:
             writer.write_received(SET_GOAL, serialize(SET_GOAL.type_name, goals[number]))
             with suppress(ValueError):
@@ -120,21 +115,18 @@ def test_the_check_takes_the_goals_that_the_robot_took(tmp_path, interface_versi
 
 def test_a_flood_of_refused_goals_leaves_an_episode_that_can_be_checked(tmp_path):
     recorder = Recorder('FetchReach')
-    runner, encoder = recorder.runner, TickEncoder(recorder.spec)
     writer = EpisodeDirectory(tmp_path).begin('FetchReach', 0, recorder.metadata())
     refused = goal_message([1.3, 0.7, 0.5], 'x' * 28_000)
     taken = goal_message([1.3, 0.6, 0.5])
     logged = 0
-    for number in range(recorder.spec.episode_ticks + 1):
-        tick = runner.advance(runner.resting_command())
-        latched = tick.status.phase != 'running'
-        writer.write_tick(tick.stamp_ns, encoder.encode(tick, latched=latched))
+    for number, (tick, messages) in enumerate(rested_episode(recorder.runner)):
+        writer.write_tick(tick.stamp_ns, messages)
         if number == 10:
             data = serialize(SET_GOAL.type_name, refused)
             for _ in range(300):
                 logged += writer.write_received(SET_GOAL, data, is_refused=True)
             assert writer.write_received(SET_GOAL, serialize(SET_GOAL.type_name, taken))
-            accept_goal(runner, SET_GOAL, taken)
+            accept_goal(recorder.runner, SET_GOAL, taken)
     path = writer.finish({})
     assert 0 < logged < 40
     omitted = json.loads(read_episode(path).result['received_not_logged'])

@@ -15,8 +15,8 @@ from fetch_hand_sim.simulation import Simulation
 from msgs_spec.codecs import build_message
 from msgs_spec.schemas import serialize
 from msgs_spec.tasks import TASKS
-from msgs_spec.tick import TickEncoder
 from msgs_spec.topics import topic
+from support.episode_recorder import rested_episode
 
 LIMIT = 10.0
 
@@ -124,12 +124,11 @@ def test_a_logged_episode_says_so_and_the_check_pushes_as_well(simulation, tmp_p
         on_error=failures.append,
         on_logged=lambda episode: None,
     )
-    runner, encoder = EpisodeRunner(simulation), TickEncoder(simulation.spec)
+    runner = EpisodeRunner(simulation)
     source = topic(simulation.spec, 'perturb')
     wrench = push('FetchPush', 'object0', 3.0, 0.0, 6.0)
-    while not runner.has_started or not runner.is_between_episodes:
-        tick = runner.advance(runner.resting_command())
-        recorder.record(tick, encoder.encode(tick, latched=tick.status.phase != 'running'))
+    for tick, messages in rested_episode(runner):
+        recorder.record(tick, messages)
         if tick.status.tick in (5, 6, 20) and tick.status.phase == 'running':
             accept_perturbation(runner, source, wrench, LIMIT)
             recorder.record_received(source, serialize(source.type_name, wrench))

@@ -7,6 +7,7 @@ import pytest
 
 from fetch_hand_sim.episodes.runner import EpisodeRunner
 from fetch_hand_sim.simulation import Simulation
+from support.episode_recorder import rested_episode
 
 
 @pytest.fixture(scope='module')
@@ -16,10 +17,7 @@ def simulation():
 
 def run_episode(runner):
     """Runs the next episode; returns its ticks."""
-    ticks = [runner.advance(runner.resting_command())]
-    while not runner.is_between_episodes:
-        ticks.append(runner.advance(runner.resting_command()))
-    return ticks
+    return [tick for tick, _ in rested_episode(runner)]
 
 
 def test_a_seed_holds_from_the_next_episode_on(simulation):

@@ -118,11 +118,9 @@ BAD_CALLS = [
     (lambda env: env.reset(seed=-1), 'greater or equal to zero'),
     (lambda env: env.reset(seed='one'), 'must be a python integer'),
     (lambda env: env.step(np.zeros(3)), r'an action of .* has shape \(20,\), not \(3,\)'),
-    (lambda env: env.step(np.zeros((1, 20))), r'has shape \(20,\), not \(1, 20\)'),
     (lambda env: env.step(np.full(20, np.nan)), r'actions\[0, 0\] is nan'),
     (lambda env: env.step(['up'] * 20), 'actions: .*up.* given'),
     (lambda env: setattr(env, 'goal', 0.3), 'goal of .*: shape'),
-    (lambda env: setattr(env, 'goal', [np.nan] * 7), 'goal of .* is nan'),
 ]
 
 
