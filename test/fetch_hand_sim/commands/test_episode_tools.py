@@ -75,10 +75,10 @@ def copy_of(episodes, tmp_path):
     return directory
 
 
-def rewrite(source, directory, change=lambda tick, name, data: data, result=None, last=None):
+def rewrite(source, directory, change=lambda tick, name, data: data, last=None, **metadata):
     """Write an episode again with changed messages; `change` returns None to leave one out."""
     episode = read_episode(source)
-    writer = EpisodeWriter(directory, source.name, episode.metadata)
+    writer = EpisodeWriter(directory, source.name, {**episode.metadata, **metadata})
     for number, tick in enumerate(split_ticks(episode)[:last]):
         changed = [(m.topic, change(number, m.topic.name, m.data)) for m in tick.published]
         writer.write_tick(tick.stamp_ns, [(t, data) for t, data in changed if data is not None])
@@ -86,7 +86,7 @@ def rewrite(source, directory, change=lambda tick, name, data: data, result=None
             writer.write_received(message.topic, message.data)
     kept = {k: v for k, v in episode.result.items() if k not in ('complete', 'reason')}
     if last is None:
-        return writer.finish({**kept, **(result or {})})
+        return writer.finish(kept)
     return writer.finish({'steps': str(last - 1)}, 'test')
 
 
@@ -188,11 +188,8 @@ def test_check_detects_missing_and_wrong_values(reach, tmp_path, change, field):
 
 
 def test_check_names_the_version_that_changed(reach, tmp_path):
-    episode = read_episode(min(reach.iterdir()))
-    writer = EpisodeWriter(tmp_path, 'old', {**episode.metadata, 'mujoco_version': '3.9.0'})
-    for tick in split_ticks(episode):
-        writer.write_tick(tick.stamp_ns, [(m.topic, m.data) for m in tick.published])
-    result = check_episode(writer.finish(episode.result))
+    path = rewrite(min(reach.iterdir()), tmp_path, mujoco_version='3.9.0')
+    result = check_episode(path)
     assert [change.split()[:2] for change in result.changed] == [['mujoco', '3.9.0']]
 
 
