@@ -44,6 +44,8 @@ def test_episodes_are_what_the_simulation_does_with_the_actions():
         episodes.desired_goal, observation['desired_goal'].astype(np.float32)
     )
     assert success == reached.mean()
+    following, _ = collector.collect(make_actor())
+    assert (following.desired_goal != episodes.desired_goal).all(), 'later cycles have new goals'
 
 
 @pytest.mark.parametrize('epsilon', [0.0, 0.3])
