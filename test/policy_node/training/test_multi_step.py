@@ -100,8 +100,9 @@ def test_every_step_of_a_return_is_rewarded_for_the_goal_of_its_row(episodes, sa
         np.testing.assert_array_equal(steps, np.minimum(sampler.most_steps, left))
 
 
-def test_a_reward_for_a_share_of_time_is_that_share_at_every_step(episodes):
-    sampler = TransitionSampler(nearness, 0.9, 3, reward_scale=0.1)
+@pytest.mark.parametrize('n_step', [1, 3])
+def test_a_reward_for_a_share_of_time_is_that_share_at_every_step(episodes, n_step):
+    sampler = TransitionSampler(nearness, 0.9, n_step, reward_scale=0.1)
     batch = sampler.sample(episodes, ROW, MIXTURE, np.random.default_rng(2))
     assert_rewards_are_those_of_a_loop(episodes, batch, lambda _, *goals: 0.1 * nearness(*goals))
 
