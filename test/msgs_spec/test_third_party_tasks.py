@@ -54,7 +54,7 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> dict[str, list[Point]]:
     return points
 
 
-def test_a_package_that_ends_the_program_costs_its_own_task(
+def test_a_package_that_exits_at_import_loses_only_its_own_task(
     installed: dict[str, list[Point]], caplog: pytest.LogCaptureFixture
 ) -> None:
     installed[tasks.SPECS] += [
@@ -98,7 +98,7 @@ def test_a_task_is_simulated_by_the_package_that_it_is_of(
         ('FetchPush', replace(PUSH, name='FetchPush'), 'another task has this name'),
     ],
 )
-def test_a_specification_that_cannot_be_listed_costs_one_warning(
+def test_a_specification_that_cannot_be_listed_gives_one_warning(
     installed: dict[str, list[Point]],
     caplog: pytest.LogCaptureFixture,
     name: str,

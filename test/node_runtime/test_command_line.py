@@ -153,7 +153,7 @@ def test_letters_that_the_output_does_not_have_are_escaped(monkeypatch):
     assert process.communicate(timeout=20) == ('\\u65e5\\u672c\n', 'tool: \\u0436\n')
 
 
-def test_a_terminal_that_closes_takes_nothing_with_it_but_the_bar():
+def test_a_closed_terminal_ends_only_the_progress_bar():
     terminal, its_other_end = pty.openpty()
     body = (
         'with progress("things", 2) as advance:\n'

@@ -25,7 +25,7 @@ def run(limit: float, code: int, held: float) -> tuple[int, str, float]:
     return ended.returncode, ended.stdout.decode(), time.monotonic() - started
 
 
-def test_a_process_that_is_held_ends_with_its_own_exit_code() -> None:
+def test_a_blocked_process_ends_with_its_own_exit_code() -> None:
     ended, output, seconds = run(0.3, 130, held=20.0)
     assert (ended, output) == (130, 'done\n')
     assert seconds < 10.0
@@ -35,7 +35,7 @@ def test_a_process_continues_after_a_body_in_time() -> None:
     assert run(0.5, 3, held=0.1)[:2] == (0, 'done\nleft\n')
 
 
-def test_a_closed_output_is_no_obstacle() -> None:
+def test_a_closed_output_does_not_stop_the_command() -> None:
     program = HELD.format(limit=5, code=3, microseconds=1000).replace(
         "print('left')", "open('/dev/stderr', 'w').write('left')"
     )

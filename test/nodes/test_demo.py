@@ -1,4 +1,4 @@
-"""`fetch_hand_sim demo`, real nodes and all, until somebody has seen enough."""
+"""`fetch_hand_sim demo` with real nodes, until Ctrl-C."""
 
 from __future__ import annotations
 
@@ -95,5 +95,5 @@ def test_a_node_that_is_still_loaded_ends_quietly():
         time.sleep(0.1)
         assert stop_node(process) == 0
         log.seek(0)
-        # A quick machine has it loaded by then, and it says what it is.
+        # On a fast machine the policy is loaded by then, and the log has a line about it.
         assert [line for line in log if not line.startswith('[INFO]')] == []

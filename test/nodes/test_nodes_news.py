@@ -16,7 +16,7 @@ from support.graph import POLICY_NODE, SIM_NODE, Start, client, end, episodes_in
 REACH = task_spec('FetchReach')
 
 
-def test_a_policy_that_is_killed_is_missed_in_real_time(start_process: Start) -> None:
+def test_a_killed_policy_is_reported_in_real_time(start_process: Start) -> None:
     sim = start_process(*SIM_NODE, *ros_args(wait_for_commands=True, real_time_factor=4.0))
     policy = start_process(*POLICY_NODE, *ros_args(policy='resting'))
     with client(REACH) as robot:

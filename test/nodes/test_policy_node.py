@@ -184,7 +184,7 @@ def test_a_robot_whose_topics_have_other_names_is_found(start_process: Start) ->
 
 
 def publish_status(robot: Client, nanosec: int = 0, **values: str) -> None:
-    """What a robot says of itself that publishes nothing else."""
+    """Publish the status of a robot that publishes nothing else."""
     status = topic(REACH, 'episode_status')
     said = episode_status(REACH).to_values() | {'phase': 'waiting', 'control_hz': '25.0'}
     message = build_status(status, 0, 'episode', said | values)

@@ -83,7 +83,7 @@ def can_render() -> bool:
     return True
 
 
-def test_a_page_acts_on_its_robot_unless_it_may_only_watch(start_process: Start) -> None:
+def test_a_page_commands_its_robot_unless_it_is_read_only(start_process: Start) -> None:
     settings = {'perturb_limit': 20.0, 'real_time_factor': 2.0}
     start_process(*SIM_NODE, *ros_args(task='FetchReach', **settings))
     goal = np.array([1.3, 0.8, 0.6])
@@ -338,7 +338,7 @@ def test_episodes_are_logged_to_the_same_bytes_with_and_without_viewers(
     first, second = (episodes_in(tmp_path / name)[:4] for name in ('alone', 'watched'))
     for alone, watched in zip(first, second, strict=True):
         assert payload(alone) == payload(watched)
-        # The one value that tells two runs apart.
+        # The only value that differs between two runs.
         assert alone.metadata.pop('started') != watched.metadata.pop('started')
         for part in ('metadata', 'result', 'attachments', 'schemas', 'channels'):
             assert getattr(alone, part) == getattr(watched, part), part
@@ -347,7 +347,7 @@ def test_episodes_are_logged_to_the_same_bytes_with_and_without_viewers(
 def test_standard_tools_get_what_they_need_also_from_a_robot_that_stands_still(
     start_process: Start,
 ) -> None:
-    # Under whatever name its state is published.
+    # Also if the topic of the joint states has another name.
     other = ('-r', 'joint_states:=/arm/joints')
     robot = start_process(*SIM_NODE, *ros_args(task='FetchReach'), *other)
     parameters = ros_args(camera_width=64, camera_height=48, camera_hz=5.0)
@@ -470,7 +470,7 @@ def test_a_fast_robot_is_seen_as_it_is_now_and_then_and_a_replay_after_it(
 
 
 @pytest.mark.release
-def test_without_opengl_the_camera_says_so_and_the_rest_goes_on(
+def test_without_opengl_only_the_camera_fails_and_reports_it(
     start_process: Start, ros_environment: dict[str, str]
 ) -> None:
     start_process(*SIM_NODE, *ros_args(task='FetchReach'))
@@ -498,7 +498,7 @@ def niceness_of_threads(process: int) -> list[int]:
         (['--task', 'FetchReach', '--policy', 'nosuch'], 'policy_node ended'),
     ],
 )
-def test_what_cannot_be_shown_is_one_line(
+def test_a_source_that_cannot_be_shown_is_one_line(
     start_process: Start, arguments: list[str], line: str
 ) -> None:
     process = start_process(*VIEW, *arguments)

@@ -23,7 +23,7 @@ def children_of(parent: int) -> list[int]:
 
 
 def start_view(start_process: Start, *arguments: str) -> tuple[subprocess.Popen[str], list[str]]:
-    """A page, and what it said until it was there."""
+    """Start a page; return its process and its output until the page is served."""
     view = start_process(*VIEW, *arguments)
     said = []
     while not said or 'The page is at' not in said[-1]:
@@ -33,7 +33,7 @@ def start_view(start_process: Start, *arguments: str) -> tuple[subprocess.Popen[
 
 
 @pytest.mark.parametrize(('number', 'is_loaded'), [(signal.SIGKILL, False), (signal.SIGHUP, True)])
-def test_the_nodes_end_with_who_started_them(
+def test_the_nodes_end_with_their_parent(
     start_process: Start, number: signal.Signals, is_loaded: bool
 ) -> None:
     view, _ = start_view(start_process, '--task', 'FetchReach')

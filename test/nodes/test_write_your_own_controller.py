@@ -23,7 +23,7 @@ def controller(tmp_path):
     return path
 
 
-def test_it_is_short_and_knows_only_ros(controller):
+def test_the_controller_is_short_and_imports_only_ros(controller):
     code = controller.read_text()
     assert sum(bool(line.strip()) for line in code.splitlines()) <= 40
     imported = {

@@ -26,7 +26,7 @@ def test_the_pages_pass(capsys: pytest.CaptureFixture[str]) -> None:
         ('![a](https://example.org/a.png)\n', 'is loaded from the internet'),
     ],
 )
-def test_a_problem_is_found(text: str, problem: str, tmp_path: Path) -> None:
+def test_a_problem_on_a_page_is_found(text: str, problem: str, tmp_path: Path) -> None:
     page = tmp_path / 'page.md'
     page.write_text(text)
     (found,) = TOOL['findings'](page)

@@ -77,7 +77,7 @@ MODULES = ('fetch_hand_sim', 'fetch_hand_sim.sim_node', 'policy_node.training.tr
 
 
 @pytest.mark.parametrize('started', [*sorted(EXECUTABLES), *(f'-m {name}' for name in MODULES)])
-def test_a_program_or_module_that_has_hardly_begun(started, programs):
+def test_ctrl_c_during_the_import_of_a_program_or_module(started, programs):
     command = started.split() if started.startswith('-m') else [programs / started]
     name = started.rpartition(' ')[2].rpartition('.')[2]
     assert interrupt_in_time(command, 1) == (130, f'{name}: stopping\n')

@@ -1,6 +1,6 @@
 """Every tutorial, followed to the letter: real nodes, real training, small budgets.
 
-`make test-release` follows them; `make test` only asks whether their command lines are understood
+`make test-release` follows them; `make test` only parses their command lines
 (test_documentation.py).
 """
 

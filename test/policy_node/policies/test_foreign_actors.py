@@ -103,7 +103,7 @@ def crafted_onnx(path, nodes, numbers):
 COLUMNS = {'zero': [0], 'four': [4], 'one': [1]}
 
 
-def test_a_few_bytes_of_onnx_that_ask_for_gigabytes_are_refused(tmp_path):
+def test_small_onnx_files_that_need_gigabytes_are_refused(tmp_path):
     nodes = [
         helper.make_node('ConstantOfShape', ['shape'], ['zeros']),
         helper.make_node('ReduceSum', ['zeros'], ['sum'], keepdims=0),

@@ -81,7 +81,7 @@ def test_what_a_study_switches_is_on_the_page_with_a_request():
 
 
 def test_scalars_of_numpy_are_values_of_python():
-    """Those of `np.linspace`, and of what was read from a file."""
+    """For example values of `np.linspace`, or values read from a file."""
     given = {
         'gamma': np.float64(0.9),
         'total_steps': np.int64(400),
@@ -282,7 +282,7 @@ def test_options_become_fields_of_their_types_and_nothing_else_is_set():
         (['--steps', '1e29'], "total_steps '1e29' is not of type int"),
     ],
 )
-def test_what_was_mistyped_is_answered_in_a_line(arguments, message, capsys):
+def test_a_typing_error_is_one_line(arguments, message, capsys):
     with pytest.raises(SystemExit) as ended:
         options_of(*arguments)
     error = capsys.readouterr().err

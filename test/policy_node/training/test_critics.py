@@ -91,7 +91,7 @@ def linear_learner(critics: int, **changes: object) -> DDPG:
 
 @torch.no_grad()
 def make_linear(network: MLP, weights: np.ndarray) -> None:
-    """The one hidden unit is far above 0, so that the network says the sum and the last weight."""
+    """Make the output the weighted sum of the inputs plus a bias: the hidden unit stays above 0."""
     network.hidden[0].weight.copy_(torch.tensor(weights[None, :-1]))
     network.hidden[0].bias.fill_(20.0)
     network.output.weight.fill_(1.0)
@@ -140,7 +140,7 @@ def test_disagreement_is_the_deviation_of_values_over_critics() -> None:
 
 
 @pytest.mark.parametrize('aggregate', ['mean', 'min', 'truncated'])
-def test_all_critics_learn_from_one_target_of_what_their_copies_say(aggregate: str) -> None:
+def test_all_critics_learn_from_one_target_of_their_copies(aggregate: str) -> None:
     batch, learner = scattered(), linear_learner(3, aggregate=aggregate)
     value, following = values_by_hand(3, batch)
     assert set(following.argmin(axis=0)) == set(following.argmax(axis=0)) == {0, 1, 2}

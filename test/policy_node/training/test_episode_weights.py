@@ -90,7 +90,7 @@ def test_a_batch_follows_the_configuration():
 
 
 def sideways(achieved, goal):
-    """-1 until the goal is met along y, then 0."""
+    """Return -1 if the distance to the goal along y is above 0.5, else 0."""
     return -1.0 * (np.abs(achieved - goal)[..., 1] > 0.5)
 
 
@@ -125,7 +125,7 @@ def test_a_drop_that_is_lost_is_worth_minus_one_for_ever(n_step, source):
         total = sum(0.9**step * (hit - 1.0) for step, hit in enumerate(reached))
         expected.append(total + 0.9**count * ends[index] * -10.0)
     np.testing.assert_allclose(batch.reward, expected, rtol=1e-5)
-    # For ever, from wherever it is seen, less what a goal that is met on the way is worth.
+    # -1 for every later tick, plus the reward of a goal that is reached on the way.
     worth = -10.0 + 0.9 ** (goal - tick - 1.0) * (source == 'future')
     np.testing.assert_allclose(batch.reward[ends], worth[ends], rtol=1e-5)
     assert len(set(batch.reward[~ends])) > n_step, 'goals are met where nothing is lost as well'

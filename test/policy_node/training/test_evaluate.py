@@ -143,7 +143,7 @@ def test_staying_is_counted_tick_by_tick():
         assert not {'dropped', 'rotation', 'long_way'} & diagnose(outcomes).keys()
 
 
-def test_objects_that_fall_and_goals_the_long_way_round_are_seen():
+def test_fallen_objects_and_goals_the_long_way_round_are_counted():
     seeds = list(range(8))
     pen = simulation(8, 'HandManipulatePenRotate')
     dropped = run_episodes(pen, RandomPolicy(20), seeds)

@@ -1,4 +1,4 @@
-"""What is there for very frequent actions, on problems with a known answer."""
+"""Methods for high action frequencies, on problems with a known solution."""
 
 from __future__ import annotations
 

@@ -84,7 +84,7 @@ def two_armed_gambles(count: int, generator: np.random.Generator) -> Episodes:
 
 
 def learnt_values(importance: str) -> dict[str, float]:
-    """What a critic believes of both arms, for a goal that only gambling ever reaches."""
+    """Return the learnt values of both arms, for a goal that only gambling reaches."""
     generator = np.random.default_rng(0)
     learner = make_learner(NetworkShape(10, 3, 1, (64, 64)), gamma=0.0, importance=importance)
     episodes = two_armed_gambles(2_000, generator)

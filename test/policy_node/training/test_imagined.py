@@ -23,7 +23,7 @@ def configured(**changes):
 
 
 class Distance(torch.nn.Module):
-    """Ticks to the goal at so many per unit of distance, whatever the action: the true value."""
+    """The true value: minus the ticks to the goal, `per_unit` for each unit of distance."""
 
     def __init__(self, per_unit):
         super().__init__()
@@ -36,7 +36,7 @@ class Distance(torch.nn.Module):
 
 
 def learner_of(**changes):
-    """One whose critic knows the values."""
+    """Return a learner whose critic has the true values."""
     torch.manual_seed(0)
     learner = ImaginingDDPG(SHAPE, configured(**changes), torch.device('cpu'), Workers())
     learner.critic = learner.target_critic = Distance(20.0)

@@ -48,7 +48,7 @@ def steps_of(batch):
 
 
 def assert_rewards_are_those_of_a_loop(episodes, batch, reward_of):
-    """What each step achieves is rewarded for the goal of the row, and discounted by 0.9 a step."""
+    """Compare with a loop: each step is rewarded for the goal of its row, discounted by 0.9."""
     expected = []
     for index, steps in enumerate(steps_of(batch)):
         row, tick = batch.observation[index].astype(int)

@@ -29,7 +29,7 @@ def test_std_has_a_floor_and_values_a_ceiling():
     np.testing.assert_allclose(normalizer.std, 0.01)
 
 
-def test_nothing_seen_changes_nothing():
+def test_an_empty_batch_changes_no_statistics():
     statistics, normalizer = RunningStatistics(3), Normalizer(3)
     statistics.update(np.zeros((0, 3)), Workers())
     statistics.write(normalizer)

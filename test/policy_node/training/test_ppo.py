@@ -63,7 +63,7 @@ def test_advantages_of_actions_for_another_goal_are_right_on_average_at_any_trac
     """Three steps of two actions, all eight ways enumerated; every way is a state of its own."""
     generator = np.random.default_rng(0)
     ways = np.array(list(itertools.product((0, 1), repeat=3)))
-    # By what was done before: the probabilities of both actions for either goal, and the reward.
+    # By the actions before: the probabilities of both actions for either goal, and the reward.
     done = [ways[:, :tick] @ (1 << np.arange(tick)) + (1 << tick) for tick in range(4)]
     wanted, meant = (generator.uniform(0.2, 0.8, 8) for _ in range(2))
 
@@ -160,7 +160,7 @@ def learn(cycles: int, **changes: object) -> tuple[PPO, RolloutMaker]:
     ],
     ids=['none', 'weighed'],
 )
-def test_ppo_learns_to_do_what_the_goal_says(changes: dict[str, object]) -> None:
+def test_ppo_learns_to_follow_the_goal(changes: dict[str, object]) -> None:
     learner, _ = learn(40, **changes)
     goal = np.linspace(-0.7, 0.7, 15, dtype=np.float32)[:, None]
     actor = learner.evaluation_actor()
@@ -179,7 +179,7 @@ def test_gain_makes_the_first_actions_small_and_leaves_their_direction() -> None
     np.testing.assert_allclose(actions[1], 0.01 * np.arctanh(actions[0]), rtol=1e-3)
 
 
-def test_outcomes_are_what_others_made_of_where_they_began() -> None:
+def test_outcomes_are_goals_achieved_from_similar_starts() -> None:
     generator = np.random.default_rng(0)
     achieved = np.zeros((3, 11, 3), np.float32)
     achieved[:, :, 0] = np.array([[0.0], [1.0], [2.0]])
@@ -259,7 +259,7 @@ def test_the_first_losses_are_those_of_the_definition() -> None:
     learner = make_ppo(config, 1, 1, 2, hidden=(4,))
     ratio = np.array([0.5, 0.5, 0.9, 1.1, 2.0, 2.0])
     advantage = np.array([1.0, -1.0, 3.0, -2.0, 4.0, -5.0])
-    # What is good gains no more beyond 1.2, what is bad loses no less below 0.8.
+    # Ratios are clipped at 1.2 for positive advantages and at 0.8 for negative ones.
     gain = np.array([0.5, -0.8, 2.7, -2.2, 4.8, -10.0])
     weight = np.array([0.1, 2.0, 1.0, 0.5, 1.5, 0.3])
     target = np.linspace(-3.0, 0.0, 6)

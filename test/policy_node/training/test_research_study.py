@@ -166,7 +166,7 @@ def test_the_chance_of_a_rank_sum_is_counted() -> None:
     assert rank_sum_chance([1.0] * 5, [1.0] * 5) == 1.0
     # Of three and three, with a tie across: 2 of 20 are as far.
     assert rank_sum_chance([1.0, 2.0, 3.0], [3.0, 4.0, 5.0]) == pytest.approx(4 / 20)
-    # Of ten and ten, of which nine are above all others: 2 * (1 + 1) of 184,756.
+    # Ten values against ten; nine of the second ten exceed all others: 2 * (1 + 1) of 184,756.
     ten = [*range(1, 11)]
     above = [*range(12, 21), 9.5]
     assert rank_sum_chance(ten, above) == pytest.approx(4 / 184_756)

@@ -133,7 +133,7 @@ def test_values_count_the_rewards_of_the_steps_left(walk):
     learner = make_ddpg(NetworkShape(1, 1, 1, (32, 32)), config, torch.device('cpu'), Workers())
     sampler = HorizonSampler(past_goal, 0.5, ticks=3)
     generator = np.random.default_rng(0)
-    # Whatever is done, a walk goes on: values of all actions are alike.
+    # Actions have no effect on a walk, so the values of all actions are equal.
     walk.action[:] = generator.uniform(-1, 1, walk.action.shape)
     for _ in range(400):
         row = generator.integers(len(walk), size=64)

@@ -69,7 +69,7 @@ def test_a_warning_names_rewards_above_0(tmp_path, capfd, monkeypatch):
 
 
 def test_the_record_contains_all_arguments_of_each_part(tmp_path):
-    """A part that was killed before it saved anything does not count, nor one without a step."""
+    """A part without a checkpoint or without a step is not recorded."""
     (tmp_path / 'command.txt').write_text('fetch_hand_sim train of before\n')
     train('FetchReach', tmp_path, recipe='best', total_steps=400, goals='future=.8', **SMALL)
     more = {'gamma': np.float64(0.9), 'total_steps': 800}

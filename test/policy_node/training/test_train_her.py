@@ -178,7 +178,7 @@ def test_graded_rewards_are_shares_of_thresholds_met():
     [
         # FetchReach's 0.05 m are 0.2 m at the start, 0.1 m after a third of the run, then 0.05 m.
         ({'first_distance': 4.0}, ([0.2], [0.1], [0.05], [0.05])),
-        # Half of the grades are met within 0.1 m.
+        # One of the two grades is reached within 0.1 m.
         ({'reward_grades': '1,2'}, ([0.1, 0.05],)),
     ],
 )
