@@ -17,7 +17,7 @@ import fetch_hand_sim
 from fetch_hand_sim.gym_envs.env import FetchHandEnv
 from fetch_hand_sim.gym_envs.gymnasium_robotics_env import FetchEnv
 from fetch_hand_sim.gym_envs.registration import environment_id
-from fetch_hand_sim.simulation import Simulation, rendering
+from fetch_hand_sim.simulation import rendering
 from fetch_hand_sim.simulation.opengl import prepare_opengl
 from msgs_spec.tasks import TASKS
 from support.tasks import each_task
@@ -113,14 +113,11 @@ BAD_CALLS = [
     (goal([0] * 6), r'goal of .*: shape \(6,\) given; .* \(7,\)'),
     (goal([*[0] * 6, np.nan]), r'goal of .*\[6\] is nan'),
     (goal([1, [2], 3]), 'goal: 3 values; allowed: one, or 1'),
-    (goal({'x': 1}), "goal of .*: {'x': 1} given"),
     (goal(np.zeros(7)), 'a goal quaternion must not be zero'),
     (lambda env: env.reset(seed=-1), 'greater or equal to zero'),
     (lambda env: env.reset(seed='one'), 'must be a python integer'),
     (lambda env: env.step(np.zeros(3)), r'an action of .* has shape \(20,\), not \(3,\)'),
     (lambda env: env.step(np.full(20, np.nan)), r'actions\[0, 0\] is nan'),
-    (lambda env: env.step(['up'] * 20), 'actions: .*up.* given'),
-    (lambda env: setattr(env, 'goal', 0.3), 'goal of .*: shape'),
 ]
 
 
@@ -146,44 +143,6 @@ def test_a_diverged_episode_is_truncated_and_the_next_has_a_goal_of_its_own():
         assert (terminated, truncated, info['diverged']) == (False, True, True)
         assert each.observation_space.contains(observation)
     assert observation['desired_goal'].tolist() == [1.3, 0.7, 0.6]
-
-
-@pytest.mark.parametrize('task', ['FetchPush', 'HandReach'])
-def test_a_method_that_only_calls_the_original_changes_no_bit(task):
-    plain, env = (
-        make(task, reward_type='dense').unwrapped,
-        make(task, reward_type='dense').unwrapped,
-    )
-    env._sample_goal = env._sample_goal
-    action = np.ones(env.action_space.shape, np.float32)
-    played = [each.reset(seed=3)[:1] + each.step(action) for each in (plain, env)]
-    for first, second in zip(played[0][:2], played[1][:2], strict=True):
-        assert {key: values.tobytes() for key, values in first.items()} == {
-            key: values.tobytes() for key, values in second.items()
-        }
-    assert played[0][2:] == played[1][2:]
-
-
-@pytest.mark.parametrize('task', ['FetchSlide', 'HandManipulatePenRotate'])
-def test_an_episode_equals_the_simulation_and_is_truncated(task):
-    env, simulation = make(task, reward_type='dense'), Simulation(task, reward_type='dense')
-    observation, info = env.reset(seed=7)
-    expected = simulation.reset(seed=[7])
-    env.action_space.seed(0)
-    truncations = []
-    for _ in range(TASKS[task].episode_ticks):
-        for name, values in expected.items():
-            assert observation[name].tobytes() == values[0].tobytes()
-        action = env.action_space.sample()
-        observation, reward, terminated, truncated, info = env.step(action)
-        result = simulation.step(action[None])
-        expected = result.observation
-        assert (reward, info['is_success']) == (result.reward[0], result.success[0])
-        goals = observation['achieved_goal'], observation['desired_goal']
-        assert env.unwrapped.compute_reward(*goals, info) == reward
-        assert not terminated
-        truncations.append(truncated)
-    assert truncations == [False] * (TASKS[task].episode_ticks - 1) + [True]
 
 
 def test_arguments_reach_the_simulation():
@@ -230,14 +189,9 @@ def test_importing_the_package_registers_without_mujoco():
     [
         ({'render_mode': 'ansi'}, "render_mode 'ansi'; allowed: human, rgb_array, depth_"),
         ({'height': 0}, r'height 0; allowed: whole numbers 1 \.\.\. 4096'),
-        ({'width': 1.5}, 'width 1.5; allowed: whole'),
         ({'default_camera_config': {'distance': 'a'}}, r"distance 'a'; allowed: as \d"),
-        (
-            {'default_camera_config': {'lookat': [np.nan] * 3}},
-            'lookat .*nan.*: finite',
-        ),
+        ({'default_camera_config': {'lookat': [np.nan] * 3}}, 'lookat .*nan.*: finite'),
         ({'default_camera_config': {'type': 3}}, r"type '3'; allowed: 0 \(free\), 1 \(trac"),
-        ({'default_camera_config': {'type': 2}}, r"fixedcamid '-1'; allowed: 0 \."),
         (
             {'default_camera_config': {'type': 2, 'fixedcamid': 99}},
             r"fixedcamid '99'; allowed: 0 \.\.\. \d",

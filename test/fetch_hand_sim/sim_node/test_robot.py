@@ -123,6 +123,10 @@ def test_commands_that_stop_are_missed_in_any_mode(make, factor):
     case.clock.now += 5.0
     case.robot.pause(True)
     assert not case.robot.misses_commands
+    case.robot.pause(False)
+    assert not case.robot.misses_commands
+    case.clock.now += 1.1
+    assert case.robot.misses_commands
     case = make('lockstep')
     assert not case.robot.misses_commands
     case.robot.tick_when_due()

@@ -89,21 +89,6 @@ def test_threads_are_as_many_as_processors_that_may_be_used(
     assert Simulation('FetchReach', num_envs).task.batch.nthread == threads
 
 
-@pytest.mark.parametrize('task', ['FetchPush', 'HandManipulatePenFull'])
-def test_a_partial_reset_leaves_the_others_alone(task):
-    simulation = Simulation(task, num_envs=5)
-    simulation.reset(seed=0)
-    play(simulation, actions(simulation, 3))
-    before = simulation.task.batch.state.copy()
-    expected = Simulation(task, num_envs=1).reset(seed=[77])
-    observation = simulation.reset(seed=[77], ids=[3])
-    after = simulation.task.batch.state
-    others = [0, 1, 2, 4]
-    assert after[others].tobytes() == before[others].tobytes()
-    for name, values in expected.items():
-        assert observation[name][3].tobytes() == values[0].tobytes()
-
-
 def test_seeds_ids_and_goals_come_in_the_order_of_the_simulations():
     simulation = Simulation('FetchPush', num_envs=3, num_threads=1)
     with pytest.raises(ResetNeeded, match=r'simulations \[0, 1, 2\]'):
@@ -156,7 +141,6 @@ def test_commands_in_radians_equal_normalised_actions():
     [
         ({'task': 'FetchJump'}, "unknown task 'FetchJump'; allowed: FetchReach, "),
         ({'num_envs': 0}, 'num_envs 0; allowed: whole numbers 1 ... 2147483647'),
-        ({'num_envs': 2**31}, 'num_envs 2147483648; allowed'),
         ({'num_threads': -1}, 'num_threads -1; '),
         ({'reward_type': 'shaped'}, "reward_type 'shaped'; allowed: sparse"),
         ({'success_rule': 'mine'}, "success_rule 'mine'; allowed: gymnasium"),
@@ -247,8 +231,6 @@ BAD_CALLS = [
     (step((1, 2), np.nan), r'actions\[1, 2\] is nan'),
     (step((1, 2), 1.5), r'actions\[1, 2\] is 1\.5; .*\[-1, 1\]'),
     (lambda one: one.reset(seed=[3, -2]), 'seed -2; allowed'),
-    (lambda one: one.reset(seed='one'), "seed 'one'"),
-    (lambda one: one.reset(seed=[0, 0.5]), 'seed 0.5; allowed'),
     (lambda one: one.reset(seed=[1, 2, 3]), '3 seeds for 2 sim'),
     (lambda one: one.reset(ids=[2]), 'ids .2.; allowed: distinct indices below 2'),
     (lambda one: one.reset(ids=[1, 1]), 'ids .1, 1.; allowed'),
@@ -257,8 +239,6 @@ BAD_CALLS = [
     (push(index=True), 'index True; '),
     (push(None), "no body 'None' that"),
     (push(wrench='abcdef'), 'wrench: abcdef given'),
-    (push(wrench=[[1], [1, 2]]), r'wrench: \[\[1\], .* given'),
-    (lambda one: one.data(None), 'index None; allowed'),
     (lambda one: one.write_data(-1, one.data(0)), 'index -1; allowed'),
     (lambda one: one.generator(2), 'index 2; allowed'),
     (lambda one: one.variation('a'), "index 'a'; allowed"),
@@ -268,8 +248,6 @@ BAD_CALLS = [
         'data MjData; allowed: .* of FetchPush, with qpos of shape',
     ),
     (lambda one: one.compute_reward('', np.zeros(3)), "achieved_goal ''; allowed: numbers"),
-    (lambda one: one.compute_success(np.zeros(3), {}), 'desired_goal {}; allowed'),
-    (lambda one: one.compute_reward(5, np.zeros(3)), 'achieved_goal of FetchPush has 3 values'),
     (lambda one: one.compute_reward(np.zeros(4), np.zeros(3)), r'last axis, not shape \(4,\)'),
     (lambda one: one.compute_reward(np.zeros((2, 3)), np.zeros(3)), r'\(2, 3\) and desired_goal'),
     (lambda one: setattr(one, 'goals', np.zeros(3)), r'shape \(3,\) given; .*\(2, 3\)'),
