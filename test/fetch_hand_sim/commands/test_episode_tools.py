@@ -386,42 +386,15 @@ def test_list_filters(reach, tmp_path, capsys):
     assert len(names('--complete', '--failure', '--task', 'FetchReach')) == 3
 
 
-def test_list_names_and_skips_unreadable_files(reach, tmp_path, capsys):
-    directory = copy_of(reach, tmp_path)
-    broken = directory / 'FetchReach_000000_seed11' / 'FetchReach_000000_seed11_0.mcap'
-    broken.write_bytes(broken.read_bytes()[:5000])
-    (directory / 'text.mcap').write_text('\x1b[31mno bag')
-    (directory / 'notes.txt').write_text('not an episode and no claim to be one')
-    (directory / 'hollow').mkdir()
-    (directory / 'hollow' / 'metadata.yaml').touch()
-    assert episodes_list.main([str(directory)]) == 1
-    output = capsys.readouterr()
-    assert '2 episodes' in output.out
-    named = [line for line in output.err.splitlines() if 'skipped' in line]
-    assert len(named) == len(output.err.splitlines()) == 3
-    for name in (str(broken), 'text.mcap', 'hollow'):
-        assert sum(name in line for line in named) == 1
-    assert '\x1b' not in output.out + output.err
-
-
-def test_list_shows_no_control_characters_of_a_file(tmp_path, capsys):
+def test_list_shows_no_control_characters_and_no_long_values_of_a_file(tmp_path, capsys):
     writer = EpisodeWriter(tmp_path, 'x', {'task': '\x1b]0;owned\x07[red]1[/red]', 'seed': '\x1b'})
     finish_short(writer, {'success': '\x9b', 'return': 'nan', 'steps': '\n'})
+    writer = EpisodeWriter(tmp_path, 'long', {'task': 'y' * 400, 'seed': '1' * 400})
+    finish_short(writer, {}, 'z' * 400)
     assert episodes_list.main([str(tmp_path)]) == 0
     output = capsys.readouterr().out
-    assert '[red]1[/red]' in output
+    assert '[red]1[/red]' in output and {'x', 'long'} <= set(output.split())
     assert output.isascii() and all(c.isprintable() or c == '\n' for c in output)
-
-
-def test_long_values_of_one_file_are_shortened(reach, tmp_path, capsys):
-    directory = copy_of(reach, tmp_path)
-    metadata = read_episode(min(reach.iterdir())).metadata
-    writer = EpisodeWriter(directory, 'x', {**metadata, 'seed': '1' * 400, 'task': 'y' * 400})
-    finish_short(writer, {'complete': 'false', 'reason': 'z' * 400})
-    assert episodes_list.main([str(directory)]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    names = {path.name for path in reach.iterdir()}
-    assert names <= {line.split()[0] for line in lines}
 
 
 def cut_off(source: Path, directory: Path, size: int) -> Path:
@@ -517,28 +490,20 @@ def test_the_command_line_generates(tmp_path, capsys):
     assert 'cannot log episode' in capsys.readouterr().err
 
 
-def test_a_policy_that_answers_nonsense_on_the_way_is_one_line(tmp_path, monkeypatch, capsys):
+def test_actions_of_a_policy_are_clipped_as_on_the_robot_or_nonsense(tmp_path, monkeypatch, capsys):
     (tmp_path / 'strange_policy.py').write_text(
         'import itertools\nimport numpy as np\ncalls = itertools.count()\n'
-        'def make(spec):\n    return lambda _: np.full(4, 0.0 if next(calls) < 20 else np.nan)\n'
+        'def strong(spec):\n    return lambda _: np.full(4, 1.5)\n'
+        'def broken(spec):\n    return lambda _: np.full(4, 0.0 if next(calls) < 20 else np.nan)\n'
     )
     monkeypatch.syspath_prepend(tmp_path)
-    arguments = ['--policy', 'strange_policy:make', '--trust', '--task', 'FetchReach']
-    arguments += ['--episodes', '1', '--threads', '1', '--output', str(tmp_path / 'out')]
-    assert generate_episodes.main(arguments) == 1
-    assert 'strange_policy:make returned [[nan' in capsys.readouterr().err
-
-
-def test_actions_beyond_the_range_are_clipped_as_on_the_robot(tmp_path, monkeypatch):
-    (tmp_path / 'strong_policy.py').write_text(
-        'import numpy as np\ndef make(spec):\n    return lambda _: np.full(4, 1.5)\n'
-    )
-    monkeypatch.syspath_prepend(tmp_path)
-    arguments = ['--policy', 'strong_policy:make', '--trust', '--task', 'FetchReach']
-    arguments += ['--episodes', '1', '--threads', '1', '--output', str(tmp_path / 'out')]
-    assert generate_episodes.main(arguments) == 0
+    arguments = ['--trust', '--task', 'FetchReach', '--episodes', '1', '--threads', '1']
+    arguments += ['--output', str(tmp_path / 'out'), '--policy']
+    assert generate_episodes.main([*arguments, 'strange_policy:strong']) == 0
     (episode,) = load_episodes(tmp_path / 'out')
     assert (episode.commands == 1.0).all()
+    assert generate_episodes.main([*arguments, 'strange_policy:broken', '--first-seed', '1']) == 1
+    assert 'strange_policy:broken returned [[nan' in capsys.readouterr().err
 
 
 def test_loaded_episodes_have_paths_and_paths_may_be_text(reach, tmp_path):

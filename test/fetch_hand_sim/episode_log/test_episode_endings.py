@@ -17,7 +17,7 @@ from fetch_hand_sim.commands import episodes_recover
 from fetch_hand_sim.episode_log import find_episodes, find_leftovers, read_episode
 from msgs_spec.tasks import task_spec
 from support import SUPPORT, script_environment
-from support.graph import SIM_NODE, TIMEOUT, client, ros_args
+from support.graph import SIM_NODE, client, end, finish, ros_args
 
 # `make torture` turns this up.
 KILLS = int(os.environ.get('EPISODE_KILLS', '10'))
@@ -27,11 +27,6 @@ SCRIPT = SUPPORT / 'killed_recorder.py'
 MOST_UNSTORED = 16
 REACH = task_spec('FetchReach')
 MIB = 1024 * 1024
-
-
-def finish(process, timeout=TIMEOUT):
-    output, errors = process.communicate(timeout=timeout)
-    return process.returncode, output + errors
 
 
 @pytest.mark.alone
@@ -85,14 +80,6 @@ def error_lines(output):
     return [line for line in output.splitlines() if '[ERROR]' in line]
 
 
-def stop(robot):
-    robot.send_signal(signal.SIGINT)
-    code, output = finish(robot)
-    assert code == 0, output
-    assert 'Traceback' not in output
-    return output
-
-
 def ticks_after(listener, count=30):
     """Waits for that many more ticks: the robot is alive."""
     before = len(listener.received['joint_states'])
@@ -123,7 +110,7 @@ def test_a_disk_that_fills_up_stops_the_log_and_not_the_robot(start_process, mou
         wait_for_failed_log(listener)
         (disk / 'filler').unlink()
         ticks_after(listener)
-    errors = error_lines(stop(robot))
+    errors = error_lines(end(robot))
     assert len(errors) == 1
     assert 'No space left on device' in errors[0] or 'MiB free on the disk' in errors[0]
     for path in find_episodes(disk / 'episodes'):
@@ -164,7 +151,7 @@ def test_a_directory_that_is_removed_while_it_is_written(start_process, tmp_path
         shutil.rmtree(directory)
         wait_for_failed_log(listener)
         ticks_after(listener, 5)
-    errors = error_lines(stop(robot))
+    errors = error_lines(end(robot))
     assert len(errors) == 1 and 'No such file or directory' in errors[0]
 
 
@@ -198,7 +185,7 @@ def test_a_robot_under_nohup_survives_its_terminal(start_process):
         ticks_after(listener, 1)
         robot.send_signal(signal.SIGHUP)
         ticks_after(listener)
-    stop(robot)
+    end(robot)
 
 
 def test_a_pipe_among_the_leftovers_holds_nothing_up(start_process, tmp_path):

@@ -9,11 +9,7 @@ import sys
 
 import pytest
 
-from fetch_hand_sim.episode_log import (
-    EpisodeDirectory,
-)
 from support import SUPPORT, script_environment
-from support.episode_recorder import Recorder
 
 # `make torture` turns this up.
 FILES = int(os.environ.get('EPISODE_MUTATIONS', '80'))
@@ -21,19 +17,13 @@ SCRIPT = SUPPORT / 'mutated_files.py'
 READERS = 6
 
 
-@pytest.fixture(scope='module')
-def episode(tmp_path_factory):
-    return Recorder('FetchReach').record(EpisodeDirectory(tmp_path_factory.mktemp('episode')))
-
-
 @pytest.mark.timeout(60 + FILES)
-def test_damaged_files_end_in_one_line_or_a_result(episode):
-    environment = script_environment()
+def test_damaged_files_end_in_one_line_or_a_result(finished):
     run = subprocess.run(
-        [sys.executable, SCRIPT, episode / f'{episode.name}_0.mcap', str(FILES), '7'],
+        [sys.executable, SCRIPT, finished / f'{finished.name}_0.mcap', str(FILES), '7'],
         capture_output=True,
         text=True,
-        env=environment,
+        env=script_environment(),
     )
     assert run.returncode == 0, run.stderr
     report = json.loads(run.stdout)

@@ -23,7 +23,6 @@ from msgs_spec.schemas import deserialize, serialize
 from msgs_spec.tasks import task_spec
 from msgs_spec.topics import topic, topics
 from node_runtime.ros import ros_message_class
-from policy_node.training import generate_episodes
 from support.fresh_actor import fresh_actor
 from support.graph import POLICY_NODE, SIM_NODE, client, finish, ros_args
 from support.ros_messages import from_ros
@@ -45,16 +44,7 @@ rclpy.spin(node)
 REACH = task_spec('FetchReach')
 # At half speed, a slow machine may fall 0.8 s behind, ten messages, before one is lost.
 RATE = 0.5
-ODD_NAMES = ('/a b', '/1st', '/a//b', '/ä', '/{node}', '/' + 300 * 'x')
-
-
-@pytest.fixture(scope='module')
-def episode(tmp_path_factory):
-    """A generated FetchReach episode."""
-    directory = tmp_path_factory.mktemp('episodes')
-    arguments = ['--policy', 'random', '--task', 'FetchReach', '--episodes', '1', '--threads', '1']
-    assert generate_episodes.main([*arguments, '--output', str(directory)]) == 0
-    return min(directory.iterdir())
+ODD_NAMES = ('/a b', '/1st', '/a//b', '/' + 300 * 'x')
 
 
 def collect(listener, name):
@@ -119,12 +109,12 @@ def test_actor_on_a_replay_repeats_the_recorded_commands(start_process, tmp_path
 
 
 @pytest.mark.alone
-def test_every_message_comes_back_as_recorded_with_its_timing(start_process, episode):
-    logged = read_episode(episode)
+def test_every_message_comes_back_as_recorded_with_its_timing(start_process, finished):
+    logged = read_episode(finished)
     with client(REACH) as listener:
         # None is lost, also of /clock, while a busy machine does not serve the test.
         listener.subscribe(depth=1000)
-        replay = start_process(*REPLAY_NODE, *ros_args(path=episode, start_paused=True))
+        replay = start_process(*REPLAY_NODE, *ros_args(path=finished, start_paused=True))
         listener.spin_until(lambda: bool(listener.received['episode_status']), 'latched status')
         subscriptions = list(listener.node.subscriptions)
         listener.spin_until(
@@ -153,8 +143,8 @@ def test_every_message_comes_back_as_recorded_with_its_timing(start_process, epi
     assert np.median(np.diff(times)) == pytest.approx(0.04, abs=0.004)
 
 
-def test_late_subscribers_get_the_latched_topics_of_an_offset(start_process, episode):
-    start_process(*REPLAY_NODE, *ros_args(path=episode, start_offset=1.0, start_paused=True))
+def test_late_subscribers_get_the_latched_topics_of_an_offset(start_process, finished):
+    start_process(*REPLAY_NODE, *ros_args(path=finished, start_offset=1.0, start_paused=True))
     with client(REACH) as listener:
         listener.subscribe('desired_goal', 'episode_status', 'joint_states')
         listener.spin_until(lambda: bool(listener.received['desired_goal']), 'the latched goal')
@@ -169,8 +159,8 @@ def test_late_subscribers_get_the_latched_topics_of_an_offset(start_process, epi
 
 
 @pytest.mark.alone
-def test_rate_loop_and_pause(start_process, episode):
-    start_process(*REPLAY_NODE, *ros_args(path=episode, rate=2.0, loop=True))
+def test_rate_loop_and_pause(start_process, finished):
+    start_process(*REPLAY_NODE, *ros_args(path=finished, rate=2.0, loop=True))
     with client(REACH) as listener:
         listener.subscribe('joint_states', '/clock')
         stamps = []
@@ -196,10 +186,10 @@ def test_rate_loop_and_pause(start_process, episode):
         assert not result.successful and '0.01' in result.reason
 
 
-def test_commands_are_published_only_when_asked_for(start_process, episode):
+def test_commands_are_published_only_when_asked_for(start_process, finished):
     with client(REACH) as listener:
         received = collect(listener, 'commands')
-        arguments = ros_args(path=episode, topics='commands, reward', rate=2.0, start_paused=True)
+        arguments = ros_args(path=finished, topics='commands, reward', rate=2.0, start_paused=True)
         replay = start_process(*REPLAY_NODE, *arguments)
         for name in ('commands', 'reward'):
             listener.spin_until(lambda: bool(listener.node.count_publishers(name)), name)  # noqa: B023
@@ -208,7 +198,7 @@ def test_commands_are_published_only_when_asked_for(start_process, episode):
         listener.spin_until(lambda: len(received) == 50, 'commands')
         assert finish(replay)[0] == 0
         commands = [decode(topic(REACH, 'commands'), message) for message in received]
-    logged = read_episode(episode).topics['/applied_command'].messages
+    logged = read_episode(finished).topics['/applied_command'].messages
     applied = topic(REACH, 'applied_command')
     expected = [decode(applied, deserialize(applied.type_name, m.data)) for m in logged]
     np.testing.assert_array_equal(commands, expected)
@@ -221,8 +211,8 @@ def assert_ends_well(replay, said=''):
     assert 'real time; topics in /' in output and output.endswith(f'{said}\n')
 
 
-def test_an_interrupted_replay_prints_one_line(start_process, episode):
-    arguments = ros_args(path=episode, wait_for_commands=True, start_paused=True)
+def test_an_interrupted_replay_prints_one_line(start_process, finished):
+    arguments = ros_args(path=finished, wait_for_commands=True, start_paused=True)
     replay = start_process(*REPLAY_NODE, *arguments)
     with client(REACH) as listener:
         listener.subscribe('episode_status')
@@ -233,10 +223,10 @@ def test_an_interrupted_replay_prints_one_line(start_process, episode):
 
 
 @pytest.mark.alone
-def test_a_listener_that_hangs_holds_up_the_end_for_a_second(start_process, episode):
+def test_a_listener_that_hangs_holds_up_the_end_for_a_second(start_process, finished):
     """Not for one per topic."""
     nowhere = {'stdout': subprocess.DEVNULL, 'stderr': subprocess.DEVNULL}
-    replay = start_process(*REPLAY_NODE, *ros_args(path=episode, loop=True))
+    replay = start_process(*REPLAY_NODE, *ros_args(path=finished, loop=True))
     listener = start_process(sys.executable, '-c', LISTENER, **nowhere)
     with client(REACH) as watcher:
         names = [spec.name for spec in topics(REACH) if spec.direction == 'published']
@@ -251,21 +241,21 @@ def test_a_listener_that_hangs_holds_up_the_end_for_a_second(start_process, epis
     assert time.monotonic() - began < 6.0
 
 
-def test_a_replay_begins_with_commands_of_another_name(start_process, episode):
+def test_a_replay_begins_with_commands_of_another_name(start_process, finished):
     commands = ('-r', '/commands:=/arm/goals')
-    arguments = ros_args(path=episode, wait_for_commands=True, rate=10.0)
+    arguments = ros_args(path=finished, wait_for_commands=True, rate=10.0)
     replay = start_process(*REPLAY_NODE, *arguments, *commands)
     start_process(*POLICY_NODE, '--ros-args', *commands)
     assert_ends_well(replay)
 
 
-def test_in_a_namespace_it_replays_a_robot_of_that_namespace(start_process, episode):
+def test_in_a_namespace_it_replays_a_robot_of_that_namespace(start_process, finished):
     """Beside the robot without one, whose topics it leaves alone."""
-    options = ros_args(path=episode, wait_for_commands=True, start_paused=True)
+    options = ros_args(path=finished, wait_for_commands=True, start_paused=True)
     with client(REACH) as listener:
         replay = start_process(*REPLAY_NODE, *options, '-r', '__ns:=/left')
         node = listener.node
-        left = [f'/left{name}' for name in read_episode(episode).topics if name != '/clock']
+        left = [f'/left{name}' for name in read_episode(finished).topics if name != '/clock']
         published = [name for name in left if not name.endswith('/commands')]
         listener.spin_until(lambda: all(map(node.count_publishers, published)), 'its topics')
         assert node.count_publishers('/clock') == 1
@@ -277,25 +267,25 @@ def test_in_a_namespace_it_replays_a_robot_of_that_namespace(start_process, epis
 
 
 @pytest.mark.release
-def test_a_policy_goes_on_when_less_than_a_second_is_replayed_again(start_process, episode):
+def test_a_policy_goes_on_when_less_than_a_second_is_replayed_again(start_process, finished):
     with client(REACH) as listener:
         received = collect(listener, 'commands')
-        arguments = ros_args(path=episode, loop=True, start_offset=1.5, wait_for_commands=True)
+        arguments = ros_args(path=finished, loop=True, start_offset=1.5, wait_for_commands=True)
         start_process(*REPLAY_NODE, *arguments)
         start_process(*POLICY_NODE)
         # A round has 13 ticks.
         listener.spin_until(lambda: len(received) > 30, 'commands of a third round')
 
 
-def test_topics_of_a_running_robot_are_rejected_unless_forced(start_process, episode):
+def test_topics_of_a_running_robot_are_rejected_unless_forced(start_process, finished):
     start_process(*SIM_NODE, *ros_args(publish_clock=False))
     with client(REACH) as listener:
         listener.spin_until(lambda: listener.node.count_publishers('joint_states'), 'a robot')
-        code, output = finish(start_process(*REPLAY_NODE, *ros_args(path=episode)))
+        code, output = finish(start_process(*REPLAY_NODE, *ros_args(path=finished)))
         assert code == 2 and ' is already published by /sim_node; ' in output
-        forced = start_process(*REPLAY_NODE, *ros_args(path=episode, force=True, rate=100.0))
+        forced = start_process(*REPLAY_NODE, *ros_args(path=finished, force=True, rate=100.0))
         assert_ends_well(forced)
-        elsewhere = start_process(*REPLAY_NODE, *ros_args(path=episode), '-r', '__ns:=/replay')
+        elsewhere = start_process(*REPLAY_NODE, *ros_args(path=finished), '-r', '__ns:=/replay')
         assert_ends_well(elsewhere)
 
 
@@ -306,24 +296,24 @@ def test_topics_of_a_running_robot_are_rejected_unless_forced(start_process, epi
         ({'start_offset': 9.0}, 'start_offset: 9.0 given; allowed: up to 2.000'),
     ],
 )
-def test_bad_parameters_end_with_one_line_and_code_2(start_process, episode, parameters, line):
-    given = {'path': episode, **parameters} if parameters else {}
+def test_bad_parameters_end_with_one_line_and_code_2(start_process, finished, parameters, line):
+    given = {'path': finished, **parameters} if parameters else {}
     code, output = finish(start_process(*REPLAY_NODE, *ros_args(**given)))
     assert code == 2
     assert line in output
     assert len(output.strip().splitlines()) == 1
 
 
-def test_a_schedule_contains_the_published_messages_in_order(episode):
-    schedule = ReplaySchedule(episode)
-    ticks = split_ticks(read_episode(episode))
+def test_a_schedule_contains_the_published_messages_in_order(finished):
+    schedule = ReplaySchedule(finished)
+    ticks = split_ticks(read_episode(finished))
     expected = [m.data for tick in ticks for m in tick.published]
     assert [message.data for message in schedule.messages] == expected
-    with_inputs = ReplaySchedule(episode, with_inputs=True)
+    with_inputs = ReplaySchedule(finished, with_inputs=True)
     assert len(with_inputs.messages) == len(expected) + 50
     assert schedule.namespace == ''
     with pytest.raises(ValueError, match="no topic 'wheels' in the episode; allowed: /clock, /jo"):
-        ReplaySchedule(episode, ['wheels'])
+        ReplaySchedule(finished, ['wheels'])
     index = schedule.index_at(2_000_000_000)
     assert schedule.messages[index].name == '/clock'
     assert schedule.messages[index].time_ns == 2_000_000_000
@@ -336,9 +326,9 @@ def test_a_schedule_contains_the_published_messages_in_order(episode):
         *((name, 0, 'topic .*; allowed: names of ROS') for name in ODD_NAMES),
     ],
 )
-def test_messages_that_ros_cannot_publish_are_refused(episode, tmp_path, namespace, lost, reason):
+def test_messages_that_ros_cannot_publish_are_refused(finished, tmp_path, namespace, lost, reason):
     """Messages without their last bytes, and topics without names of ROS."""
-    whole = read_episode(episode)
+    whole = read_episode(finished)
     writer = EpisodeWriter(tmp_path, 'odd', whole.metadata, namespace=namespace)
     for tick in split_ticks(whole)[:3]:
         messages = [(m.topic, m.data[: len(m.data) - lost]) for m in tick.published]
