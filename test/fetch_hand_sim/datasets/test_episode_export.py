@@ -112,7 +112,7 @@ def test_episodes_of_the_recovered_environment_are_as_long_as_those_logged(
         pytest.param('lerobot', marks=pytest.mark.release),
     ],
 )
-def test_a_full_disk_leaves_nothing_that_stands_in_the_way(episodes, tmp_path, format_, capsys):
+def test_a_full_disk_leaves_no_partial_file(episodes, tmp_path, format_, capsys):
     pytest.importorskip('minari' if format_ == 'minari' else 'pyarrow')
     code = (
         'import resource, sys\n'

@@ -186,7 +186,7 @@ def export_code(arguments: list[str]) -> int:
         return int(end.code or 0)
 
 
-def test_an_object_free_task_has_the_goal_alone_as_its_environment(tmp_path):
+def test_the_environment_of_a_task_without_object_is_its_goal(tmp_path):
     Recorder('FetchReach', 12.5).record(EpisodeDirectory(tmp_path / 'logged'))
     assert _export(tmp_path / 'logged', tmp_path) == 0
     info = json.loads((tmp_path / 'FetchReach/meta/info.json').read_text())

@@ -188,7 +188,7 @@ def test_a_robot_under_nohup_survives_its_terminal(start_process):
     end(robot)
 
 
-def test_a_pipe_among_the_leftovers_holds_nothing_up(start_process, tmp_path):
+def test_a_pipe_among_the_leftovers_does_not_block(start_process, tmp_path):
     (tmp_path / '.bad.active').mkdir()
     os.mkfifo(tmp_path / '.bad.active' / 'bad_0.mcap')
     arguments = ros_args(episode_dir=tmp_path, episodes=1, real_time_factor=0.0)

@@ -95,7 +95,7 @@ def test_a_flooded_episode_checks_and_replays(tmp_path, recorder, ticks):
     assert len(ReplaySchedule(path).messages) == sum(len(tick.messages) for tick in ticks)
 
 
-def test_a_flood_of_commands_takes_nothing_from_goals(tmp_path, recorder, ticks):
+def test_a_flood_of_commands_leaves_room_for_goals(tmp_path, recorder, ticks):
     flood = [('commands', 24)] * (2 * limits.MAX_RECEIVED_MESSAGES) + [('set_goal', 100)]
     episode = read_episode(write(tmp_path, recorder, ticks, flood))
     assert len(episode.topics['/set_goal'].messages) == 1

@@ -256,7 +256,7 @@ def test_the_models_come_with_the_episode_and_compile(reach, tmp_path):
     assert len(text) < 64 * 1024
 
 
-def test_a_fingerprint_is_that_of_the_model_and_not_of_the_folder_it_lies_in(reach, tmp_path):
+def test_a_model_hash_does_not_depend_on_the_folder(reach, tmp_path):
     original = asset_path('fetch/reach.xml')
     shutil.copytree(original.parents[1], tmp_path / 'elsewhere')
     models = [
@@ -303,7 +303,7 @@ def test_an_episode_without_messages_leaves_nothing(reach, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_completed_writer_takes_no_more(reach, tmp_path):
+def test_a_finished_writer_rejects_messages(reach, tmp_path):
     writer = EpisodeWriter(tmp_path, 'episode', {})
     reach.recorder.write(writer, reach.ticks)
     path = writer.finish({})

@@ -221,7 +221,7 @@ def test_an_episode_whose_directory_is_cleared_away_while_it_begins_takes_the_ne
 @pytest.mark.parametrize(
     ('step', 'call'), [('open_regular', 0), ('open_regular', 1), ('try_lock', 1), ('publish', 0)]
 )
-def test_of_two_recoveries_at_once_one_makes_the_bag_and_the_other_says_so(
+def test_one_of_two_simultaneous_recoveries_makes_the_bag_and_the_other_reports_it(
     killed, tmp_path, monkeypatch, step, call, capsys
 ):
     """The other one comes right after a file was opened or locked, or before the bag is shown."""
@@ -384,9 +384,7 @@ def test_files_that_are_no_episodes_are_rejected_by_all_readers(tmp_path):
     assert find_episodes(tmp_path) == sorted(tmp_path.glob('*.mcap'))
 
 
-def test_a_robot_that_begins_its_file_while_the_rest_is_cleared_away_keeps_it(
-    tmp_path, monkeypatch
-):
+def test_clearing_the_folder_keeps_the_file_of_a_starting_episode(tmp_path, monkeypatch):
     leftover = files.active_path(tmp_path, 'FetchReach_000000_seed0')
     leftover.mkdir()
     file = files.bag_file(leftover, 'FetchReach_000000_seed0')

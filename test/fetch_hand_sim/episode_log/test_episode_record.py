@@ -65,19 +65,19 @@ NUMBERS = ('inf', '-inf', 'nan', '', '-1', str(2**63), '1e999', '9' * 5000, '1.5
 
 @pytest.mark.parametrize('text', NUMBERS)
 @pytest.mark.parametrize('name', ['seed', 'episode', 'interface_version'])
-def test_numbers_are_numbers(name, text):
+def test_invalid_numbers_in_the_metadata_are_refused(name, text):
     with pytest.raises(ValueError, match=rf'^{name} ') as caught:
         EpisodeRecord.parse(metadata(**{name: text}))
     assert len(str(caught.value)) < 200 and str(caught.value).isprintable()
 
 
 @pytest.mark.parametrize('text', ['0', '-1', 'nan', 'inf', '1e-300', '7', '', 'x' * 5000])
-def test_rates_are_rates(text):
+def test_invalid_rates_in_the_metadata_are_refused(text):
     with pytest.raises(ValueError, match=r'^control_hz '):
         EpisodeRecord.parse(metadata(control_hz=text))
 
 
-def test_words_are_words():
+def test_unknown_words_in_the_metadata_are_refused():
     for name, text in (
         ('reward_type', 'Dense'),
         ('success_rule', ''),
@@ -99,7 +99,7 @@ def test_what_is_missing_is_named(name):
 
 
 @pytest.mark.parametrize('text', [*NUMBERS, 'True', '[' * 100_000, '{"a": "b"}', 'null'])
-def test_an_outcome_that_says_nothing_readable_is_none(text):
+def test_an_unreadable_outcome_is_none(text):
     names = ('steps', 'return', 'success', 'complete', 'received_not_logged')
     outcome = EpisodeOutcome.parse(dict.fromkeys(names, text))
     assert outcome.is_success is None and not outcome.is_complete

@@ -33,7 +33,7 @@ def test_it_reads_and_loads():
     assert len(ReplaySchedule(EPISODE).messages) == 459
 
 
-def test_it_checks(capsys):
+def test_an_old_episode_is_checked_and_listed(capsys):
     assert episodes_check.main([str(OLD)]) == 0
     assert 'identical, 51 ticks, 459 messages' in capsys.readouterr().out
     assert episodes_list.main([str(OLD)]) == 0

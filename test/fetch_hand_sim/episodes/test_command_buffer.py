@@ -68,7 +68,7 @@ def test_a_command_is_held_after_the_timeout_and_its_age_outlives_the_episode():
 
 
 @pytest.mark.parametrize('names', ['xyz', ('x', 'y', 'z', 'turn'), ('gripper', 'x', 'y', 'z', 'a')])
-def test_a_robot_with_other_commands_holds_when_they_stop(names):
+def test_a_third_party_robot_holds_its_position_when_commands_stop(names):
     now = [0.0]
     parts = tuple(CommandPart(name, -1.0, 1.0, 'x 0.05 m') for name in names)
     buffer = CommandBuffer(replace(REACH, command=parts), 0.5, clock=lambda: now[0])

@@ -16,7 +16,7 @@ from fetch_hand_sim.simulation import Simulation
 ROBOTS = 2
 
 
-def test_ctrl_c_tells_of_every_episode_that_is_finished(tmp_path: Path) -> None:
+def test_ctrl_c_reports_every_finished_episode(tmp_path: Path) -> None:
     logged = []
     simulation = Simulation('FetchReach', num_envs=ROBOTS, num_threads=1)
     asked = 0

@@ -152,7 +152,7 @@ def test_a_slow_disk_delays_no_tick(
 
 
 @pytest.mark.alone
-def test_a_robot_that_is_faster_than_its_disk_waits_and_says_so(
+def test_a_robot_faster_than_its_disk_waits_and_reports_it(
     tmp_path: Path, ticks: Ticks, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write_tick, slow = EpisodeWriter.write_tick, []
@@ -178,7 +178,7 @@ def read(directory: Path) -> dict[str, object]:
     return dict(read_episode(path).topics)
 
 
-def test_a_disk_that_takes_nothing_any_more_stops_the_log(
+def test_a_stuck_disk_stops_the_log(
     tmp_path: Path, ticks: Ticks, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     stuck = threading.Event()
@@ -191,7 +191,7 @@ def test_a_disk_that_takes_nothing_any_more_stops_the_log(
     assert longest < 2.0
 
 
-def test_a_disk_that_never_takes_the_end_is_waited_for_until_somebody_gives_up(
+def test_closing_waits_for_a_stuck_disk_until_the_user_gives_up(
     tmp_path: Path, ticks: Ticks, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     stuck, errors, slow = threading.Event(), [], []
@@ -210,7 +210,7 @@ def test_a_disk_that_never_takes_the_end_is_waited_for_until_somebody_gives_up(
     assert recorder.has_failed
 
 
-def test_a_disk_that_fails_behind_the_robots_back_is_said_once(
+def test_a_disk_error_in_the_writing_thread_is_reported_once(
     tmp_path: Path, ticks: Ticks, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(writer: EpisodeWriter, stamp_ns: int, messages: Messages) -> bool:
@@ -222,7 +222,7 @@ def test_a_disk_that_fails_behind_the_robots_back_is_said_once(
     assert not [path for path in (tmp_path / 'recorder').iterdir() if path.name[0] != '.']
 
 
-def test_what_a_paused_robot_receives_reaches_the_system_without_another_tick(
+def test_messages_of_a_paused_robot_are_flushed_without_a_tick(
     tmp_path: Path, ticks: Ticks
 ) -> None:
     recorder = recorder_into(tmp_path, pytest.fail)
@@ -245,7 +245,7 @@ def chunks(path: Path) -> list[Chunk]:
     return found
 
 
-def test_a_recorder_that_has_failed_idles(
+def test_a_failed_recorder_uses_no_processor_time(
     tmp_path: Path, ticks: Ticks, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Tasks that are queued after the failure are neither run nor waited for."""
@@ -267,7 +267,7 @@ def test_a_recorder_that_has_failed_idles(
     assert errors == ['episode log stopped: disk full']
 
 
-def test_a_disk_that_has_failed_holds_the_end_up_no_longer_than_said(
+def test_closing_after_a_disk_error_waits_no_longer_than_the_limit(
     tmp_path: Path, ticks: Ticks, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     begun, gone_on, stored = (threading.Event() for _ in range(3))

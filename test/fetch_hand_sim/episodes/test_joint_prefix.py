@@ -73,7 +73,7 @@ def test_logs_of_renamed_joints_are_checked_and_loaded_as_the_others(
         np.testing.assert_array_equal(mine.object_pose, its.object_pose)
 
 
-def test_status_tells_a_prefix_that_is_not_the_usual_one(simulations):
+def test_the_status_contains_an_unusual_joint_prefix(simulations):
     for prefix in (JOINT_PREFIX, 'rh_'):
         runner = EpisodeRunner(simulations['HandReach'], joint_prefix=prefix)
         spec, data = TickEncoder(runner.spec).encode_status(0, runner.waiting_status())

@@ -115,7 +115,7 @@ def test_between_episodes_nothing_is_pushed(simulation):
         )
 
 
-def test_a_logged_episode_says_so_and_the_check_pushes_as_well(simulation, tmp_path, capsys):
+def test_a_logged_push_is_repeated_by_the_check(simulation, tmp_path, capsys):
     context = RecordingContext(simulation, with_compiled_model=False, perturb_limit=LIMIT)
     failures = []
     recorder = EpisodeRecorder(

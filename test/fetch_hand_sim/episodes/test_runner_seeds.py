@@ -20,7 +20,7 @@ def run_episode(runner):
     return [tick for tick, _ in rested_episode(runner)]
 
 
-def test_a_seed_holds_from_the_next_episode_on(simulation):
+def test_a_seed_takes_effect_at_the_next_episode(simulation):
     runner = EpisodeRunner(simulation, first_seed=3)
     seen = [run_episode(runner)[0].status.seed for _ in range(2)]
     runner.set_next_seed(100)

@@ -126,7 +126,7 @@ def test_the_last_picture_of_an_mp4_is_where_its_time_says(tmp_path):
 
 
 @pytest.mark.parametrize('side', [10, 224])
-def test_what_ffmpeg_says_is_not_lost_with_the_pipe(side, tmp_path, monkeypatch):
+def test_the_error_message_of_ffmpeg_is_kept(side, tmp_path, monkeypatch):
     pytest.importorskip('imageio_ffmpeg')
     ffmpeg = tmp_path / 'ffmpeg'
     ffmpeg.write_text('#!/bin/sh\necho "No space left on device" >&2\nexit 1\n')
@@ -162,7 +162,7 @@ def test_two_processes_that_write_one_film_leave_a_whole_one(tmp_path):
     assert [each.name for each in tmp_path.iterdir()] == [path.name]
 
 
-def test_a_disk_that_may_only_be_read_is_one_line(tmp_path, monkeypatch):
+def test_a_read_only_disk_is_one_line(tmp_path, monkeypatch):
     """As Linux does it: it looks for a file only where it may write."""
 
     def refuse(path, *_, **options):
@@ -176,7 +176,7 @@ def test_a_disk_that_may_only_be_read_is_one_line(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize('out', ['film.avi', 'film', 'nosuch/film.gif'])
-def test_what_cannot_be_written_is_said_before_drawing(out, tmp_path):
+def test_an_unwritable_file_is_reported_before_drawing(out, tmp_path):
     with pytest.raises(ValueError, match=out.rpartition('/')[2] or out):
         check_kind(tmp_path / out)
     for name in (out, 'film.png'):
@@ -206,7 +206,7 @@ def test_a_sheet_that_a_file_cannot_hold_is_one_line_before_drawing(
 
 
 @pytest.mark.usefixtures('opengl')
-def test_in_a_grid_pictures_say_who_is_at_the_goal(folder, tmp_path):
+def test_pictures_in_a_grid_mark_success(folder, tmp_path):
     recordings = load_recordings(folder, 3)
     reached = [[frame.is_success for frame in each.frames] for each in recordings]
     index = next(index for index, each in enumerate(zip(*reached, strict=True)) if any(each))
@@ -275,7 +275,7 @@ def partly_damaged(folder, tmp_path):
 
 
 @pytest.mark.usefixtures('opengl')
-def test_what_cannot_be_read_is_left_out_and_said(partly_damaged, tmp_path, capsys):
+def test_unreadable_files_are_skipped_and_reported(partly_damaged, tmp_path, capsys):
     path = tmp_path / 'grid.png'
     arguments = ['--grid', '2x1', '--out', str(path), '--size', '64x48']
     assert episodes_film([str(partly_damaged), *arguments]) == 0
@@ -326,7 +326,7 @@ def test_a_size_is_two_numbers(folder, size, capsys):
     assert f'{size!r} given; allowed: 1x1 ... 4096x4096' in error
 
 
-def test_without_opengl_it_says_what_to_install(folder, tmp_path):
+def test_without_opengl_the_remedy_is_printed(folder, tmp_path):
     code = (
         'import ctypes, sys\n'
         'def gone(name): raise OSError(name)\n'
@@ -428,7 +428,7 @@ def test_film_episode_plays_to_the_end_with_a_policy_or_a_function(opengl):
 
 @pytest.mark.parametrize('lost', [0, 50, -1])
 def test_a_pose_of_the_object_that_is_missing_is_one_line(lost, tmp_path):
-    """Poses are no part of what is observed, so that nothing else looks at their number."""
+    """Poses are not observed, so no other check counts them."""
     recorder = Recorder('HandManipulateEggRotate')
     writer = EpisodeDirectory(tmp_path).begin(recorder.spec.name, 0, recorder.metadata())
     ticks = recorder.ticks()

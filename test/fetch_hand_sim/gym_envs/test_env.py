@@ -300,7 +300,7 @@ for _ in range(2):
 
 
 def rendered(start: str = '') -> list[str]:
-    """What a process prints that begins with some lines and draws twice."""
+    """Return the lines that a process prints which runs `start` and renders twice."""
     code = RENDER.format(start=start)
     result = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True)
     assert result.returncode == 0, result.stderr
@@ -359,7 +359,7 @@ def test_a_forked_process_does_not_wait_for_the_opengl_of_its_parent(draw):
     assert result.stdout.splitlines() == ['this process was forked'] * 2, result.stderr
 
 
-def test_without_a_display_a_window_says_what_it_needs(monkeypatch):
+def test_without_a_display_the_remedy_is_printed(monkeypatch):
     monkeypatch.delenv('DISPLAY', raising=False)
     monkeypatch.delenv('WAYLAND_DISPLAY', raising=False)
     with pytest.raises(RuntimeError, match="render_mode 'human' needs a display"):
@@ -378,7 +378,7 @@ def test_a_task_is_made_by_its_name_alone(monkeypatch):
         fetch_hand_sim.make('fetch_hand_sim/FetchReech-v0')
 
 
-def test_a_name_that_is_none_is_answered_with_those_that_there_are(monkeypatch):
+def test_an_unknown_name_is_answered_with_the_known_ones(monkeypatch):
     for each in [each for each in gymnasium.registry if 'FetchPush' in each or 'HandRea' in each]:
         monkeypatch.delitem(gymnasium.registry, each)
     for name, line in (

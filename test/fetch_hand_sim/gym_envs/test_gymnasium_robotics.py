@@ -46,7 +46,7 @@ LEFT_OUT = {
 
 @pytest.fixture(scope='module')
 def report() -> dict:
-    """What differs between reference and ours."""
+    """The differences between the reference and this package."""
     result = subprocess.run(
         [sys.executable, '-O', SIDE_BY_SIDE, *COMPARED], capture_output=True, text=True
     )

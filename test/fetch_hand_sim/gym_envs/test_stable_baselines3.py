@@ -104,7 +104,7 @@ def test_reset_options_count_once_as_of_a_dummy_vec_env():
     ours.reset()
 
 
-def test_an_episode_that_a_method_of_somebodys_own_ends_has_no_time_limit():
+def test_an_episode_ended_by_a_user_method_has_no_time_limit():
     env = FetchHandVecEnv('FetchReach', 2, max_episode_steps=2)
     env.batch.compute_terminated = lambda achieved_goal, desired_goal, info: np.array([True, False])
     env.reset()

@@ -127,7 +127,7 @@ def test_successes_and_endings_of_a_subclass_count_as_in_gymnasiums_vectorisatio
     assert ends.any(axis=1).all() and not ends.all()
 
 
-def test_actions_of_those_who_only_begin_count_for_nothing():
+def test_actions_of_environments_that_start_are_ignored():
     env = make_vec('FetchReach', 2, max_episode_steps=3)
     env.reset(seed=0)
     for _ in range(3):

@@ -223,7 +223,7 @@ def test_an_interrupted_replay_prints_one_line(start_process, finished):
 
 
 @pytest.mark.alone
-def test_a_listener_that_hangs_holds_up_the_end_for_a_second(start_process, finished):
+def test_a_hanging_callback_delays_the_end_by_one_second(start_process, finished):
     """Not for one per topic."""
     nowhere = {'stdout': subprocess.DEVNULL, 'stderr': subprocess.DEVNULL}
     replay = start_process(*REPLAY_NODE, *ros_args(path=finished, loop=True))
@@ -304,7 +304,7 @@ def test_bad_parameters_end_with_one_line_and_code_2(start_process, finished, pa
     assert len(output.strip().splitlines()) == 1
 
 
-def test_a_schedule_contains_the_published_messages_in_order(finished):
+def test_a_replay_schedule_contains_the_published_messages_in_order(finished):
     schedule = ReplaySchedule(finished)
     ticks = split_ticks(read_episode(finished))
     expected = [m.data for tick in ticks for m in tick.published]

@@ -176,7 +176,7 @@ def test_real_time_factor_changes_while_running(make, factor):
         lambda robot: (robot.pause(True), robot.pause(False)),
     ],
 )
-def test_a_robot_that_is_meddled_with_ticks_no_faster_than_asked(make, meddle):
+def test_requests_do_not_make_a_robot_tick_faster(make, meddle):
     case = make(factor=0.08)
     for _ in range(32):
         if case.robot.wait() <= 0.0:

@@ -135,7 +135,7 @@ CHANGES = {
 
 
 def write(model: mujoco.MjModel, field: str, geoms: np.ndarray) -> None:
-    """What friction and the rest are made to be, of some geoms."""
+    """Change friction, or another contact field, of some geoms."""
     getattr(model, f'geom_{field}')[geoms] = CHANGES[field]
     if field in ('solmix', 'priority'):
         # These alone change nothing where both geoms have the same.
@@ -164,7 +164,7 @@ def test_contacts_are_of_what_is_written_into_geoms(task, field):
     assert found != before
 
 
-def test_pairs_that_somebody_wrote_himself_stay_until_their_geoms_change():
+def test_pairs_written_by_the_user_stay_until_their_geoms_change():
     simulation = Simulation('HandManipulateEggFull', num_threads=1)
     model = simulation.model
     simulation.apply_model_changes()

@@ -1,4 +1,4 @@
-"""A robot and a task of somebody else's, from `Task` itself: what it must offer."""
+"""A third-party robot and task, made from `Task` itself, and what they must define."""
 
 from __future__ import annotations
 
@@ -297,7 +297,7 @@ def test_the_camera_looks_at_a_model_of_its_own(make):
     simulation.asset.write_text(MJCF.replace('<mujoco>', statistic))
     view = Scene('ArmReach').view
     assert (view.lookat, view.distance) == ((2.0, 1.0, 0.5), 6.0)
-    # What is made from one of the thirteen looks like it.
+    # A task made from one of the thirteen has the same view.
     make(looks_like='FetchPush')
     assert Scene('ArmReach').view == default_view(simulation.spec)
     assert Scene('FetchPush').view == default_view(TASKS['FetchPush'])

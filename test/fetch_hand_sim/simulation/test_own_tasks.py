@@ -71,7 +71,7 @@ def test_a_model_may_be_named_by_its_path(monkeypatch):
     assert Scene('Mine').model.nq == simulation.model.nq
 
 
-def test_sensors_are_on_for_who_reads_them_and_change_no_bit():
+def test_sensors_run_only_when_read_and_change_no_bit():
     class Touching(BlockNear):
         def __init__(self, spec, batch):
             super().__init__(spec, batch)

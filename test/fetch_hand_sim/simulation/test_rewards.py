@@ -130,7 +130,7 @@ def test_the_pen_may_turn_about_its_axis_in_every_row_of_a_batch():
 
 
 @pytest.mark.parametrize('name', ['reward', 'success'])
-def test_what_a_metric_of_its_own_says_holds_for_steps_too(name):
+def test_a_metric_of_a_task_is_used_in_steps_too(name):
     def other(self, achieved_goal, desired_goal, info=None):
         return self.distances(achieved_goal, desired_goal)[0] > 0.01
 

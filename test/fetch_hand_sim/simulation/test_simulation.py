@@ -40,7 +40,7 @@ def play(simulation: Simulation, played: np.ndarray) -> np.ndarray:
 
 
 def saved(simulation: Simulation) -> dict[str, Any]:
-    """What `pickle` keeps of a simulation."""
+    """The state that `pickle` stores of a simulation."""
     return simulation.__getstate__()
 
 
@@ -298,7 +298,7 @@ def test_memory_does_not_grow_with_episodes(task):
 
 
 @pytest.mark.parametrize('task', ['FetchPush', 'HandReach', 'HandManipulateEggFull'])
-def test_a_simulation_frees_its_memory_when_nobody_has_it_any_more(task):
+def test_a_simulation_without_references_frees_its_memory(task):
     gc.disable()
     try:
         simulation = Simulation(task, num_threads=1)

@@ -32,7 +32,7 @@ def test_a_silent_visitor_is_absent_and_a_departed_one_is_noticed_once():
     assert not attendance.is_there and attendance.has_left()
     attendance.note()
     attendance.end_visit()
-    # The next visitor is in control before anyone asks.
+    # The next visitor controls the robot before the page asks who left.
     attendance.note()
     assert attendance.is_there and attendance.has_left() and not attendance.has_left()
 
@@ -141,7 +141,7 @@ def test_pictures_show_new_goals_at_once_and_nothing_of_an_earlier_robot(robot):
     assert picture.frame is None and picture.facts.phase == 'waiting'
 
 
-def test_a_node_that_hangs_is_asked_seldom(node, monkeypatch):
+def test_a_hanging_node_is_asked_rarely(node, monkeypatch):
     asked = []
 
     class Hanging:

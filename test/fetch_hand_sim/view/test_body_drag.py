@@ -24,7 +24,7 @@ LIMIT = 10.0
 
 
 class Window:
-    """What a viewer has: a model with its state, a camera, a perturbation."""
+    """The parts of a viewer: a model with its state, a camera, a perturbation."""
 
     def __init__(self, task):
         self.scene = Scene(task)
@@ -65,7 +65,7 @@ def test_the_object_is_taken_where_it_is_seen_and_follows_the_mouse(task):
 
 @pytest.mark.parametrize('task', ['FetchReach', 'HandReach'])
 def test_the_pull_reaches_the_limit_a_tenth_of_the_view_away(task):
-    """Whatever the body weighs: fingers are as easy to pull as arms."""
+    """The pull does not depend on the mass of the body, so fingers are as easy to pull as arms."""
     window = Window(task)
     name = 'robot0:gripper_link' if task == 'FetchReach' else 'robot0:palm'
     assert window.begin_at(window.data.body(name).xpos)

@@ -1,4 +1,4 @@
-"""How often the page of a robot is built, by a clock that is told what time it is."""
+"""The frame rate of the page of a robot, with a clock that the test sets."""
 
 import dataclasses
 
@@ -8,7 +8,7 @@ from fetch_hand_sim.view.web import FrameRate, Touch
 
 
 def frames(rate, begin, end, touch=lambda now: Touch(), work=1 / 60):
-    """Times at which frames begin, each of which takes a while."""
+    """Return the times at which frames begin; each frame takes `work` seconds."""
     now, times = begin, []
     while now < end:
         now += rate.wait_time(now, touch(now))
@@ -38,7 +38,7 @@ def test_a_fast_robot_is_drawn_less_often_and_a_moving_mouse_often():
     assert len(moving) == pytest.approx(120, abs=2)
 
 
-def test_a_hand_that_rests_is_forgotten():
+def test_a_resting_pointer_is_ignored():
     rate = FrameRate()
     moved = Touch(mouse=(3.0, 4.0))
     assert len(frames(rate, 10.0, 10.4, lambda now: moved)) == pytest.approx(24, abs=2)

@@ -125,7 +125,7 @@ def test_a_pose_moves_only_where_its_position_counts():
 
 
 class Hands:
-    """An ImGui in which somebody chooses a finger and moves one slider by 1 cm."""
+    """Stands for ImGui: the user chooses a finger and moves one slider by 1 cm."""
 
     def __init__(self, finger, axis):
         self.finger, self.axis = finger, axis

@@ -164,7 +164,7 @@ def test_server_gives_the_page_and_opens_it_to_no_other_site(address):
     assert get(address, '/drop').status == 403
 
 
-def test_a_page_that_can_only_watch_does_not_call_its_visitor_controlling(address):
+def test_a_read_only_page_calls_no_visitor_controlling(address):
     program = get(address, '/web_client.wasm').read()
     assert b'\0Watching\0' in program and b'Controlling' not in program
 
@@ -181,7 +181,7 @@ def test_server_refuses_web_sockets_of_other_sites(address):
 @pytest.mark.parametrize(
     ('error', 'is_said'), [(ConnectionClosedOK(None, None), False), (ValueError('x'), True)]
 )
-def test_a_visitor_who_leaves_is_no_error(address, caplog, error, is_said):
+def test_a_closed_connection_is_no_error(address, caplog, error, is_said):
     logging.getLogger('asyncio').error('Task exception was never retrieved', exc_info=error)
     assert ('never retrieved' in caplog.text) == is_said
 

@@ -39,7 +39,7 @@ pytestmark = [
 ]
 
 VIEW = (sys.executable, '-m', 'fetch_hand_sim.view')
-# What the browser draws below the scene.
+# Height of the bar below the scene, pixels.
 BAR = 32
 # Seconds in which a page changes: a machine without a GPU that does other things too is slow.
 PATIENCE = 180.0
@@ -55,7 +55,7 @@ def browser():
 
 
 def address_of(process: subprocess.Popen[str]) -> str:
-    """Waits for the line that says where the page is."""
+    """Wait for the line with the address of the page; return the address."""
     for line in process.stdout:
         if found := re.search(r'http://\S+', line):
             return found[0]
@@ -92,7 +92,7 @@ def wait_for(browser: Browser, condition: Callable[[np.ndarray], bool], what: st
 
 
 def wait_until_still(browser: Browser, part: tuple[slice, slice]) -> np.ndarray:
-    """Waits until a part of the page, which moves, no more does."""
+    """Wait until a part of the page stops moving; return the last picture."""
     pictures = [browser.screenshot()]
 
     def is_still(picture: np.ndarray) -> bool:
@@ -227,7 +227,7 @@ def pause_with_goal(robot: Client, goal: np.ndarray) -> None:
 
 
 def wait_for_moves(connection: Client, moves: list[float]) -> None:
-    """Waits until the robot is told to move by that along its axes."""
+    """Wait until the applied command has these first three components."""
     connection.spin_until(
         lambda: np.allclose(latest(connection, 'applied_command')[:3], moves),
         f'moves {moves}',
@@ -240,7 +240,7 @@ def test_files_are_listed_and_opened_and_the_timeline_moves_them(browser, start_
     paths = [recorder.record(EpisodeDirectory(tmp_path)) for _ in range(8)]
     goals = [load_episode(path).goals[0] for path in paths]
     places = [place_of('FetchPush', goal) for goal in goals]
-    # One that is not where a panel is, nor where the first one has its goal.
+    # An episode whose goal is under no panel and not at the goal of the first one.
     number = next(
         number
         for number, (x, y) in enumerate(places)
@@ -273,14 +273,14 @@ def test_files_are_listed_and_opened_and_the_timeline_moves_them(browser, start_
 def test_a_robot_is_pulled_with_control_and_the_mouse(browser, start_process, robot):
     browser.open(address_of(start_process(*VIEW)))
     wait_for_scene(browser)
-    # Nobody commands, so it stays where it is.
+    # There are no commands, so it rests.
     robot.spin_until(lambda: robot.received['achieved_goal'], 'gripper')
     rest = latest(robot, 'achieved_goal')
     x, y = place_of('FetchReach', rest)
     browser.move(x, y)
     browser.press_key('Control')
     browser.press(x, y)
-    # What is taken is what is under the mouse when the page draws its next frame.
+    # The page takes the body under the mouse when it draws its next frame.
     browser.wait(4.0)
     browser.wait_for_frames(8)
     for step in range(1, 9):
@@ -293,7 +293,7 @@ def test_a_robot_is_pulled_with_control_and_the_mouse(browser, start_process, ro
     keep('pulled', browser.screenshot())
     browser.release(x + 64.0, y - 64.0)
     browser.release_key('Control')
-    # The next episode, if not this one, is one that nobody pushes.
+    # At the latest the next episode has no push.
     robot.spin_until(
         lambda: np.linalg.norm(latest(robot, 'achieved_goal') - rest) < 5e-4,
         'gripper at rest',
@@ -365,8 +365,8 @@ def test_arrow_keys_command_until_the_robot_is_another(
     assert np.allclose(latest(robot, 'applied_command'), 0.0)
 
 
-def test_a_page_that_is_no_longer_seen_lets_go_of_the_robot(browser, start_process, robot):
-    """And whoever comes next does not go on where the first visitor was."""
+def test_a_hidden_page_stops_commanding_the_robot(browser, start_process, robot):
+    """The next visitor starts anew, not from the settings of the first one."""
     address = address_of(start_process(*VIEW))
     browser.open(address)
     take_over(browser, robot)
@@ -393,7 +393,7 @@ def test_dragging_the_goal_moves_it_and_the_actor_gets_there(browser, start_proc
     url = address_of(start_process(*VIEW))
     browser.open(url)
     wait_for_scene(browser)
-    # Before the robot, as the camera sees it.
+    # In front of the robot in the view of the camera.
     goal = np.array([1.45, 0.6, 0.65])
     pause_with_goal(robot, goal)
     x, y = place_of('FetchReach', goal)

@@ -71,18 +71,18 @@ def test_on_a_telephone_nothing_lies_on_another_and_the_robot_is_seen(places_on)
     x, y, is_shown = zip(*seen, strict=True)
     assert x == (MARGIN,) * 3 and is_shown == (True, False, False)
     assert y[1] >= y[0] + HEIGHT and y[2] > y[1] + 2.0 * MARGIN
-    # What somebody asks for stays.
+    # A panel that the user opens stays open.
     drawn._hidden.discard('Curves')
     places = places_on(390.0).places
     assert places['Curves'][2] and places['Episodes'][1] >= places['Curves'][1] + HEIGHT
 
 
-def test_an_episode_says_how_it_ended(tmp_path):
+def test_the_metadata_of_an_episode_contain_its_ending(tmp_path):
     path = Recorder('FetchReach').record(EpisodeDirectory(tmp_path))
     assert describe(path) in (f'{path.name}  reached', f'{path.name}  missed')
 
 
-def test_what_cannot_be_read_is_listed_all_the_same(tmp_path):
+def test_unreadable_files_are_listed(tmp_path):
     damaged = tmp_path / 'damaged.mcap'
     damaged.write_bytes(b'nothing')
     assert describe(damaged) == 'damaged  unreadable'

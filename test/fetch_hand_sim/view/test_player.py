@@ -164,7 +164,7 @@ def test_the_first_readable_episode_is_opened_and_unreadable_ones_are_named(fold
     assert shown(player) == (0, '')
 
 
-def test_episodes_that_are_gone_are_said_to_be(folder, tmp_path, clock):
+def test_deleted_episodes_are_reported(folder, tmp_path, clock):
     shutil.copytree(folder, tmp_path / 'gone')
     player = Player(find_playable(tmp_path / 'gone'), clock)
     shutil.rmtree(tmp_path / 'gone')

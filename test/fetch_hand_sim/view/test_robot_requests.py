@@ -1,4 +1,4 @@
-"""What the page may do to a robot, and what never leaves it."""
+"""Requests from the page to a robot: which are sent and which are refused."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ WRENCH = np.array([30.0, 0.0, 40.0, 0.0, 0.0, 0.0])
 
 
 class Desk:
-    """The page's side of a robot, and what the page is told."""
+    """The requests of a page to a robot, with the facts that the page shows."""
 
     def __init__(self, node):
         self.node, self.facts = node, Facts()
@@ -99,7 +99,7 @@ def test_a_node_that_does_not_answer_is_not_paused_and_replays_leave_nothing_beh
 
 
 class Choice:
-    """An ImGui in which somebody chooses an entry of a list, by its name."""
+    """Stands for ImGui: the user chooses an entry of a list by its name."""
 
     def __init__(self, name=None):
         self.name, self.shown, self.names = name, '', []
@@ -139,7 +139,7 @@ def test_any_speed_is_shown(monkeypatch, speed, shown):
 
 
 @pytest.mark.parametrize('is_silent', [True, False])
-def test_the_page_says_of_a_robot_that_it_is_gone(is_silent, monkeypatch):
+def test_the_page_shows_that_a_robot_is_gone(is_silent, monkeypatch):
     said = []
     monkeypatch.setattr(robot_panel, 'imgui', Choice())
     monkeypatch.setattr(robot_panel, 'say', said.append)

@@ -49,7 +49,7 @@ def test_a_joint_goes_on_and_stays_within_its_limits():
 
 
 @pytest.mark.parametrize('robot', [FETCH, SHADOW_HAND])
-def test_choosing_goes_round(robot):
+def test_choosing_wraps_around(robot):
     keys = Teleoperation(robot, None)
     keys.select(-1)
     assert keys.selected == len(robot.command) - 1

@@ -1,4 +1,4 @@
-"""What `view` cannot show is one line with the exit code of its kind; nothing is left running."""
+"""If `view` cannot show a source, it prints one line, returns the right exit code and ends."""
 
 from __future__ import annotations
 
@@ -113,7 +113,7 @@ def test_a_node_that_dies_is_named_with_its_cause(code, said, tmp_path):
 
 
 @pytest.mark.parametrize('answer', [True, False])
-def test_without_a_browser_it_says_what_to_do(capsys, answer):
+def test_without_a_browser_the_remedy_is_printed(capsys, answer):
     open_browser('http://127.0.0.1:8080/', lambda url: answer).join()
     said = capsys.readouterr().out
     assert said == ('' if answer else 'No browser was found: open the address in one\n')
