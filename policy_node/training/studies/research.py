@@ -38,7 +38,17 @@ _SKILLED_PUSH = {
     'learning_starts': 20_000,
     'random_epsilon': 0.1,
 }
-_SLIDE = {**_LONG, 'total_steps': 2_000_000, 'evaluate_every': 64_000}
+# Without what `best` has since these studies.
+_SLIDE = {
+    **_LONG,
+    'total_steps': 2_000_000,
+    'evaluate_every': 64_000,
+    'goal_features': 'plain',
+    'reward_grades': '',
+    'policy_delay': 1,
+    'actor_average': 0.9,
+    'final_exploration': 1.0,
+}
 HAND: dict[str, Any] = {**_LONG, 'total_steps': 1_000_000, 'evaluate_every': 64_000}
 _SCREENED = {'total_steps': 400_000, 'evaluate_every': 64_000, 'evaluation_episodes': 128}
 # Imagined subgoals, learnt every fourth time.
