@@ -14,7 +14,6 @@ from msgs_spec.parameters import LARGEST_SEED
 from node_runtime.command_line import (
     EXIT_SUCCESS,
     CommandParser,
-    UsageError,
     progress,
     run_command,
     whole_number,
@@ -38,6 +37,7 @@ from policy_node.training.policy_options import (
     make_chosen_simulation,
     policy_errors,
     require_writable,
+    usage_errors,
     write_result,
 )
 
@@ -76,7 +76,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _run(options: argparse.Namespace) -> int:
     loaded = load_chosen_policy(options)
     simulation = make_chosen_simulation(options, loaded)
-    other = _load_other(options, loaded.task, simulation.control_hz)
+    other = None
+    if options.against is not None:
+        with usage_errors('--against: '):
+            other = load_policy(options.against, loaded.task, trust=options.trust)
+            other.require_rate(simulation.control_hz)
     for file in (options.json, options.csv):
         if file not in (None, _STDOUT):
             require_writable(file)
@@ -120,22 +124,6 @@ def _write(options: argparse.Namespace, report: dict[str, Any], outcomes: Episod
             write_result(options.json, to_json(report))
         if options.csv is not None:
             write_result(options.csv, _to_csv(outcomes))
-
-
-def _load_other(options: argparse.Namespace, task: str, control_hz: float) -> LoadedPolicy | None:
-    """Return the policy of `--against`, or None.
-
-    Raises:
-        UsageError: If it cannot be loaded or acts at another frequency than `control_hz`.
-    """
-    if options.against is None:
-        return None
-    try:
-        other = load_policy(options.against, task, trust=options.trust)
-        other.require_rate(control_hz)
-    except ValueError as error:
-        raise UsageError(f'--against: {error}') from None
-    return other
 
 
 def _evaluate(

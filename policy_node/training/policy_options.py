@@ -55,10 +55,18 @@ def load_chosen_policy(options: argparse.Namespace) -> LoadedPolicy:
     """
     if not options.policy and options.task is None:
         raise UsageError(f'--policy is missing; allowed: {POLICY_NAMES}')
+    with usage_errors():
+        loaded = load_policy(options.policy, options.task, trust=options.trust)
+    return loaded
+
+
+@contextmanager
+def usage_errors(prefix: str = '') -> Iterator[None]:
+    """Turn a `ValueError` in the block into a `UsageError` with `prefix` before its message."""
     try:
-        return load_policy(options.policy, options.task, trust=options.trust)
+        yield
     except ValueError as error:
-        raise UsageError(str(error)) from None
+        raise UsageError(f'{prefix}{error}') from None
 
 
 @contextmanager
@@ -76,8 +84,8 @@ def make_chosen_simulation(options: argparse.Namespace, loaded: LoadedPolicy) ->
     Raises:
         UsageError: If an option does not fit the policy.
     """
-    try:
-        return Simulation(
+    with usage_errors():
+        simulation = Simulation(
             loaded.task,
             num_envs=min(options.num_envs, options.episodes),
             num_threads=options.threads,
@@ -86,8 +94,7 @@ def make_chosen_simulation(options: argparse.Namespace, loaded: LoadedPolicy) ->
             control_hz=loaded.control_hz or DEFAULT_CONTROL_HZ,
             disturbances=options.disturbances,
         )
-    except ValueError as error:
-        raise UsageError(str(error)) from None
+    return simulation
 
 
 def require_writable(file: Path) -> None:
