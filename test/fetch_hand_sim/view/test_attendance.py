@@ -32,7 +32,7 @@ def test_a_silent_visitor_is_absent_and_a_departed_one_is_noticed_once():
     assert not attendance.is_there and attendance.has_left()
     attendance.note()
     attendance.end_visit()
-    # The next visitor controls the robot before the page asks who left.
+    # The next visitor takes control before `has_left` is read.
     attendance.note()
     assert attendance.is_there and attendance.has_left() and not attendance.has_left()
 
