@@ -17,7 +17,7 @@ STAMP := $(VENV)/.complete
 # not leak in. Some hundred processes share the bytecode.
 unexport PYTHONDONTWRITEBYTECODE PYTHONPATH PYTHONHOME AMENT_PREFIX_PATH LD_LIBRARY_PATH _ROS_WHEELS_BOOTSTRAP_COMPLETE
 
-.PHONY: help env demo docs tables pictures test test-alone test-nodes test-others test-browser lint format twin bench-sim bench-view bench-camera bench-her bench-paper bench-lockstep bench-rate bench-real-time bench-episodes torture test-release clean distclean
+.PHONY: help env demo docs tables pictures test test-alone test-nodes test-others test-the-rest test-browser lint style types format twin bench-sim bench-view bench-camera bench-her bench-paper bench-lockstep bench-rate bench-real-time bench-episodes torture test-release clean distclean
 
 help:
 	@echo 'make demo [TASK=$(TASK)] [EPISODES=$(EPISODES)]  run the robot and its actor, log every episode'
@@ -68,8 +68,12 @@ NODE_TESTS := test/nodes test/fetch_hand_sim/replay_node \
 	test/fetch_hand_sim/episode_log/test_episode_endings.py \
 	test/fetch_hand_sim/episodes/test_episode_recorder.py
 
-test: lint
-	@$(MAKE) --no-print-directory --keep-going -j1 test-alone test-nodes test-others
+test: style
+	@$(MAKE) --no-print-directory --keep-going -j1 test-alone test-nodes test-the-rest
+
+# mypy without its cache uses one core for 40 s: beside tests that compute, it costs half of that.
+test-the-rest:
+	@$(MAKE) --no-print-directory --keep-going -j2 types test-others
 
 test-alone: env
 	$(BIN)/python -m pytest -m 'alone and not release' --reruns 1 $(NODE_TESTS)
@@ -80,9 +84,13 @@ test-nodes: env
 test-others: env
 	$(BIN)/python -m pytest --reruns 1 -n auto --maxprocesses 4 --dist worksteal $(addprefix --ignore=,$(NODE_TESTS))
 
-lint: env
+lint: style types
+
+style: env
 	$(BIN)/python -m ruff check $(PYTHON_FILES)
 	$(BIN)/python -m ruff format --check $(PYTHON_FILES)
+
+types: env
 	$(BIN)/python -m mypy
 
 test-browser: env
