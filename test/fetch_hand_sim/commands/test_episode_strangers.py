@@ -9,7 +9,6 @@ import struct
 import subprocess
 import sys
 import time
-from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 
@@ -25,7 +24,6 @@ from fetch_hand_sim.commands import (
     episodes_recover,
 )
 from fetch_hand_sim.episode_log import (
-    EpisodeDirectory,
     EpisodeLogError,
     EpisodeReadError,
     find_leftovers,
@@ -37,7 +35,6 @@ from fetch_hand_sim.episode_log import (
 from fetch_hand_sim.replay_node.schedule import ReplaySchedule
 from msgs_spec.schemas import schema_text
 from support import script_environment
-from support.episode_recorder import Recorder
 
 NAME = 'FetchReach_000000_seed0'
 
@@ -301,22 +298,6 @@ def test_a_name_that_leads_elsewhere_creates_nothing(finished, tmp_path, name, c
     assert episodes_export.main(arguments) in (1, 2)
     assert_one_line_each(capsys.readouterr().err, 1)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_an_episode_without_a_step_is_left_out_of_a_dataset_by_name(tmp_path, capsys):
-    """Such as the episode of a robot in lockstep without commands."""
-    pytest.importorskip('minari')
-    recorder, episodes = Recorder('FetchReach'), EpisodeDirectory(tmp_path / 'episodes')
-    recorder.record(episodes)
-    writer = episodes.begin('FetchReach', recorder.runner.seed, recorder.metadata())
-    recorder.write(writer, [replace(recorder.ticks()[0], command=None)])
-    assert writer.finish({'success': 'false', 'return': '0.0'}) is not None
-    arguments = [str(episodes.path), '--to', 'minari', '--output', str(tmp_path / 'data')]
-    assert episodes_export.main(arguments) == 1
-    printed = capsys.readouterr()
-    assert '1 episodes of FetchReach: Minari dataset FetchReach/logged-v0' in printed.out
-    assert 'seed1: no steps; Minari needs at least one' in printed.err
-    assert_one_line_each(printed.err, 1)
 
 
 def test_an_export_has_the_episodes_that_a_list_has(finished, tmp_path, capsys):

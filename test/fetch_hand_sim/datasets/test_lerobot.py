@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from fetch_hand_sim.commands import episodes_export
 from fetch_hand_sim.datasets import lerobot
 from fetch_hand_sim.datasets.lerobot import color_statistics
 from fetch_hand_sim.datasets.writing import why_apart
@@ -17,7 +15,6 @@ from fetch_hand_sim.episode_log import EpisodeDirectory, load_episodes
 from fetch_hand_sim.episode_log.arrays import load_episode
 from fetch_hand_sim.films.recording import Studio, load_recordings
 from fetch_hand_sim.simulation.opengl import prepare_opengl
-from policy_node.training import generate_episodes
 from support.episode_recorder import Recorder
 
 parquet = pytest.importorskip('pyarrow.parquet')
@@ -27,21 +24,9 @@ DATA, EPISODES = 'data/chunk-000/file-{:03d}.parquet', 'meta/episodes/chunk-000/
 
 
 @pytest.fixture(scope='module')
-def episodes(tmp_path_factory):
-    directory = tmp_path_factory.mktemp('episodes')
-    arguments = ['--policy', 'random', '--task', TASK, '--episodes', '3', '--threads', '1']
-    assert generate_episodes.main([*arguments, '--output', str(directory)]) == 0
-    return directory
-
-
-def _export(source: Path, output: Path) -> int:
-    return episodes_export.main([str(source), '--to', 'lerobot', '--output', str(output)])
-
-
-@pytest.fixture(scope='module')
-def dataset(episodes, tmp_path_factory):
+def dataset(episodes, export, tmp_path_factory):
     output = tmp_path_factory.mktemp('datasets')
-    assert _export(episodes, output) == 0
+    assert export(episodes, 'lerobot', output) == 0
     return output / TASK
 
 
@@ -108,9 +93,9 @@ def test_statistics_are_those_of_all_frames(dataset):
         assert found['count'] == [150]
 
 
-def test_long_datasets_are_several_files(episodes, tmp_path, monkeypatch):
+def test_long_datasets_are_several_files(episodes, export, tmp_path, monkeypatch):
     monkeypatch.setattr(lerobot, '_FILE_MEGABYTES', 0.01)
-    assert _export(episodes, tmp_path) == 0
+    assert export(episodes, 'lerobot', tmp_path) == 0
     rows = parquet.read_table(tmp_path / TASK / EPISODES).to_pylist()
     assert [row['data/file_index'] for row in rows] == [0, 1, 2]
     indices = [
@@ -124,14 +109,13 @@ FILM = 'videos/observation.images.scene/chunk-000/file-000.mp4'
 
 
 @pytest.mark.release
-def test_films_show_every_frame_and_say_where_each_episode_begins(episodes, tmp_path):
+def test_films_show_every_frame_and_say_where_each_episode_begins(episodes, export, tmp_path):
     imageio_ffmpeg = pytest.importorskip('imageio_ffmpeg')
     try:
         prepare_opengl()
     except RuntimeError as error:
         pytest.skip(str(error))
-    arguments = ['--to', 'lerobot', '--output', str(tmp_path), '--pictures', '64x48']
-    assert episodes_export.main([str(episodes), *arguments]) == 0
+    assert export(episodes, 'lerobot', tmp_path, '--pictures', '64x48') == 0
     reader = imageio_ffmpeg.read_frames(str(tmp_path / TASK / FILM))
     about = next(reader)
     pictures = [np.frombuffer(picture, np.uint8).reshape(48, 64, 3) for picture in reader]
@@ -164,51 +148,41 @@ def test_colors_are_summed_up_as_numbers_are():
 
 
 @pytest.mark.parametrize(
-    ('arguments', 'says'),
+    ('to', 'options', 'line'),
     [
-        (['--to', 'lerobot', '--pictures', '95x96'], 'must be even'),
-        (['--to', 'minari', '--pictures', '96x96'], 'is for --to lerobot'),
-        (['--to', 'lerobot', '--camera', 'gripper_camera_rgb'], 'needs --pictures'),
-        (['--to', 'lerobot', '--pictures', '96x96', '--camera', 'nosuch'], 'nosuch'),
+        ('lerobot', '--pictures 95x96', 'must be even'),
+        ('minari', '--pictures 96x96', '--pictures is for --to lerobot, not minari'),
+        ('lerobot', '--camera gripper_camera_rgb', 'needs --pictures'),
+        ('lerobot', '--pictures 96x96 --camera nosuch', 'nosuch'),
+        ('parquet', '--name mine', '--name is for --to minari, not parquet'),
     ],
 )
-def test_films_that_cannot_be_are_refused(episodes, tmp_path, arguments, says, capsys):
-    code = export_code([str(episodes), '--output', str(tmp_path / 'out'), *arguments])
-    assert code == 2
-    assert says in capsys.readouterr().err
+def test_options_that_do_not_fit_are_refused(episodes, export, tmp_path, to, options, line, capsys):
+    assert export(episodes, to, tmp_path / 'out', *options.split()) == 2
+    assert line in capsys.readouterr().err
     assert not list(tmp_path.rglob('*.*'))
 
 
-def export_code(arguments: list[str]) -> int:
-    try:
-        return episodes_export.main(arguments)
-    except SystemExit as end:
-        return int(end.code or 0)
-
-
-def test_the_environment_of_a_task_without_object_is_its_goal(tmp_path):
+def test_the_environment_of_a_task_without_object_is_its_goal(export, tmp_path):
     Recorder('FetchReach', 12.5).record(EpisodeDirectory(tmp_path / 'logged'))
-    assert _export(tmp_path / 'logged', tmp_path) == 0
+    assert export(tmp_path / 'logged', 'lerobot', tmp_path) == 0
     info = json.loads((tmp_path / 'FetchReach/meta/info.json').read_text())
     assert info['fps'] == 12.5
     assert info['features']['observation.state']['shape'] == [10]
     assert info['features']['observation.environment_state']['shape'] == [3]
 
 
-@pytest.mark.parametrize(
-    ('rate', 'changes', 'said'),
-    [
-        (25.0, {'reward_type': 'dense'}, 'reward_type dense, and sparse in'),
-        (25.0, {'success_rule': 'paper'}, 'success_rule paper, and gymnasium in'),
-        (25.0, {'timing': 'ticks'}, ''),
-        (50.0, {'timing': 'ticks'}, 'timing ticks, and seconds in'),
-    ],
-)
-def test_what_a_dataset_has_one_of(rate, changes, said, tmp_path):
-    first = load_episode(Recorder('FetchReach', rate).record(EpisodeDirectory(tmp_path)))
-    other = replace(first, record=replace(first.record, **changes))
-    assert why_apart(first, first) == ''
-    assert why_apart(other, first).startswith(said) and bool(why_apart(other, first)) == bool(said)
+def test_a_dataset_has_one_rule_of_rewards_and_one_timing(finished, tmp_path):
+    def apart(episode, **changes):
+        other = replace(episode, record=replace(episode.record, **changes))
+        return why_apart(other, episode)
+
+    usual = load_episode(finished)
+    fast = load_episode(Recorder('FetchReach', 50.0).record(EpisodeDirectory(tmp_path)))
+    assert apart(usual) == apart(usual, timing='ticks') == ''
+    assert apart(usual, reward_type='dense').startswith('reward_type dense, and sparse in')
+    assert apart(usual, success_rule='paper').startswith('success_rule paper, and gymnasium in')
+    assert apart(fast, timing='ticks').startswith('timing ticks, and seconds in')
 
 
 def test_lerobot_reads_it(dataset, monkeypatch):
