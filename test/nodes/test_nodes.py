@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +21,7 @@ from support.graph import (
     Client,
     Start,
     client,
+    end,
     episodes_in,
     finish,
     ros_args,
@@ -69,12 +69,20 @@ def test_topics_have_the_promised_type_and_quality_and_commands_by_name_move_the
 def test_every_task_runs_and_logs_its_topics(
     start_process: Start, tmp_path: Path, task: str
 ) -> None:
-    arguments = ros_args(task=task, episodes=1, real_time_factor=0.0, episode_dir=tmp_path)
+    parameters = {'task': task, 'episodes': 1, 'seed': 5, 'episode_dir': tmp_path}
+    arguments = ros_args(**parameters, real_time_factor=0.0, use_sim_time=True)
     namespace = ('-r', f'__ns:=/{task}')
     code, output = finish(start_process(*SIM_NODE, *arguments, *namespace), 120.0)
     assert code == 0, output
     (episode,) = episodes_in(tmp_path)
     spec = task_spec(task)
+    sim_time, settings, logged = output.strip().splitlines()
+    assert 'use_sim_time is set back to false: sim_node itself publishes simulated' in sim_time
+    assert settings.endswith(
+        f'{task}, 25 ticks per simulated second, as fast as possible; topics in /{task}; '
+        f'log: {tmp_path}; no commands yet'
+    )
+    assert f'episode 0 seed 5: {spec.episode_ticks} steps, return' in logged
     names = {s: s.name if s.name[0] == '/' else f'/{task}/{s.name}' for s in topics(spec)}
     published = [s for s in topics(spec) if s.direction == 'published']
     assert {names[source] for source in published} == set(episode.topics)
@@ -109,15 +117,20 @@ def test_bad_commands_are_dropped_and_good_ones_clipped(
         assert robot.received['applied_command'] == []
         robot.command(0.25, -7.0, 1e300, 0.5)
         robot.spin_until(lambda: bool(robot.received['applied_command']), 'a tick')
-        assert list(robot.received['applied_command'][0].data) == [0.25, -1.0, 1.0, 0.5]
-    sim.send_signal(signal.SIGINT)
-    code, output = finish(sim)
-    assert code == 0, output
+        applied = robot.received['applied_command']
+        assert list(applied[0].data) == [0.25, -1.0, 1.0, 0.5]
+        # Every command of a burst has its own tick.
+        burst = [0.125 * number for number in range(1, 8)]
+        for value in burst:
+            robot.command(value, 0, 0, 0)
+        robot.spin_until(lambda: len(applied) > len(burst), 'a tick for each')
+        robot.spin(0.3)
+        assert [message.data[0] for message in applied[1:]] == burst
+    output = end(sim)
     assert 'commands dropped: 3 values given; allowed: 4' in output
     assert 'set_goal dropped: 1e+06 given; allowed: -1000 ... 1000' in output
-    assert 'Traceback' not in output
     (episode,) = episodes_in(tmp_path)
-    assert len(episode.topics['/commands'].messages) == 7
+    assert len(episode.topics['/commands'].messages) == 7 + len(burst)
 
 
 def test_a_robot_rests_obeys_holds_pauses_steps_and_resets(start_process: Start) -> None:
@@ -166,8 +179,10 @@ def test_a_robot_rests_obeys_holds_pauses_steps_and_resets(start_process: Start)
     assert (stamps > 0).all() and set(stamps % 40_000_000) == {0}
 
 
-def test_a_robot_that_waits_for_commands_can_be_seeded_and_stepped(start_process: Start) -> None:
-    start_process(*SIM_NODE, *ros_args(wait_for_commands=True))
+def test_a_robot_that_waits_for_commands_can_be_seeded_and_stepped_to_its_end(
+    start_process: Start,
+) -> None:
+    sim = start_process(*SIM_NODE, *ros_args(wait_for_commands=True, episodes=2))
     with client(REACH) as robot:
         assert robot.set_parameter('sim_node', 'seed', 9).successful
         # Late subscribers receive it, too.
@@ -184,17 +199,7 @@ def test_a_robot_that_waits_for_commands_can_be_seeded_and_stepped(start_process
         assert robot.call(Trigger, 'sim_node/step').success
         assert robot.call(SetBool, 'sim_node/pause', data=False).message == 'running at 1.000 s'
         robot.spin_until(lambda: len(robot.stamps('/clock')) > 5, 'ticks')
-
-
-def test_a_stepped_robot_needs_no_commands(start_process: Start) -> None:
-    """Steps start the next episode and are enough for the last one."""
-    arguments = ros_args(episodes=2, mode='lockstep', wait_for_commands=True)
-    sim = start_process(*SIM_NODE, *arguments)
-    with client(REACH) as robot:
-        robot.subscribe('episode_status')
         assert robot.call(SetBool, 'sim_node/pause', data=True).success
-        for _ in range(3):
-            assert robot.call(Trigger, 'sim_node/step').success
         answer = robot.call(Trigger, 'sim_node/reset')
         assert 'a tick of its own starts episode 1' in answer.message
         robot.spin_until(
@@ -203,7 +208,10 @@ def test_a_stepped_robot_needs_no_commands(start_process: Start) -> None:
         )
         for _ in range(REACH.episode_ticks):
             assert robot.call(Trigger, 'sim_node/step').success
-        assert finish(sim)[0] == 0
+        code, output = finish(sim)
+    assert code == 0, output
+    assert 'log: off; waits for commands' in output
+    assert 'episode 1 seed 10: 50 steps, return' in output
 
 
 def test_killed_simulation_leaves_finished_episodes_and_a_marked_rest(

@@ -25,7 +25,6 @@ from support.graph import (
     Start,
     client,
     end,
-    episodes_in,
     finish,
     ros_args,
 )
@@ -119,6 +118,15 @@ def test_hostile_messages_on_every_input_leave_robot_policy_and_log_sound(
         robot.spin_until(lambda: len(robot.reports()) > 1, 'a report')
         report = robot.values()
         positions = np.array([message.position for message in robot.received['joint_states']])
+        # For a parameter of an unknown type, the services of rclpy raise an error in the node.
+        given = [Parameter(name='real_time_factor', value=ParameterValue(type=200))]
+        answer = robot.call(SetParameters, 'sim_node/set_parameters', parameters=given)
+        together = robot.call(
+            SetParametersAtomically, 'sim_node/set_parameters_atomically', parameters=given
+        )
+    for result in (*answer.results, together.result):
+        assert not result.successful
+        assert result.reason.startswith('real_time_factor: type 200 given; allowed: 0 (NO')
     assert np.isfinite(positions).all()
     refused = [int(count) for name, count in report.items() if name.startswith('rejected: ')]
     assert sum(refused) > hostile_count / 20
@@ -130,77 +138,6 @@ def test_hostile_messages_on_every_input_leave_robot_policy_and_log_sound(
     check = [sys.executable, '-m', 'fetch_hand_sim', 'episodes', 'check', *logged]
     result = subprocess.run(check, capture_output=True, text=True)
     assert logged and result.returncode == 0, result.stdout + result.stderr
-
-
-def test_a_parameter_of_an_unknown_type_is_rejected(start_process: Start) -> None:
-    """For it, the services of rclpy raise an error, which ends the node."""
-    sim = start_process(*SIM_NODE)
-    given = [Parameter(name='real_time_factor', value=ParameterValue(type=200))]
-    with client(REACH) as robot:
-        answer = robot.call(SetParameters, 'sim_node/set_parameters', parameters=given)
-        together = robot.call(
-            SetParametersAtomically, 'sim_node/set_parameters_atomically', parameters=given
-        )
-    for result in (*answer.results, together.result):
-        assert not result.successful
-        assert result.reason.startswith('real_time_factor: type 200 given; allowed: 0 (NO')
-    end(sim)
-
-
-@pytest.mark.release
-def test_two_arms_and_a_hand_in_one_graph(start_process: Start, tmp_path: Path) -> None:
-    robots = {'arm1': 'FetchReach', 'arm2': 'FetchReach', 'hand': 'HandReach'}
-    sims, policies = {}, []
-    for index, (name, task) in enumerate(robots.items()):
-        namespace = ['-r', f'__ns:=/{name}']
-        policies.append(start_process(*POLICY_NODE, *ros_args(policy='random'), *namespace))
-        arguments = ros_args(
-            task=task,
-            mode='lockstep',
-            seed=3,
-            episodes=2,
-            wait_for_commands=True,
-            publish_clock=index == 0,
-            episode_dir=tmp_path / name,
-        )
-        sims[name] = start_process(*SIM_NODE, *arguments, *namespace)
-    outputs = {}
-    for name, sim in sims.items():
-        code, outputs[name] = finish(sim, timeout=90.0)
-        assert code == 0, outputs[name]
-    assert not any('/clock is also' in output for output in outputs.values())
-    logged = {name: episodes_in(tmp_path / name) for name in robots}
-    for name, episodes in logged.items():
-        assert [episode.is_complete for episode in episodes] == [True, True]
-        others = [t for t in episodes[0].topics if t != '/clock' and not t.startswith(f'/{name}/')]
-        assert others == []
-
-    def states(name: str) -> list[bytes]:
-        return [m.data for m in logged[name][0].topics[f'/{name}/joint_states'].messages]
-
-    # Alone in their namespaces: equal robots with equal policies do the same.
-    assert states('arm1') == states('arm2')
-    for policy in policies:
-        end(policy)
-
-
-def test_a_second_source_of_time_is_reported(start_process: Start) -> None:
-    first = start_process(*SIM_NODE, *ros_args(), '-r', '__ns:=/a')
-    second = start_process(*SIM_NODE, *ros_args(), '-r', '__ns:=/b')
-    with client(REACH) as robot:
-        robot.subscribe('/diagnostics')
-
-        def named() -> bool:
-            found = robot.received['/diagnostics']
-            warned = [m.status[0].name for m in found if 'clock:=false' in m.status[0].message]
-            return len(set(warned)) == 2
-
-        robot.spin_until(named, 'error')
-    for sim in (first, second):
-        sim.send_signal(signal.SIGINT)
-    outputs = [finish(sim)[1] for sim in (first, second)]
-    assert '/clock is also published by /b/sim_node' in outputs[0]
-    assert '/clock is also published by /a/sim_node' in outputs[1]
 
 
 @pytest.mark.release

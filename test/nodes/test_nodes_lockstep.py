@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import signal
-import time
 from pathlib import Path
 
 from std_srvs.srv import Trigger
 
 from fetch_hand_sim.episode_log import Episode, read_summary
 from fetch_hand_sim.episodes.checker import check_episode
-from msgs_spec.codecs import message_stamp
 from msgs_spec.tasks import task_spec
 from policy_node.training import generate_episodes
 from support.graph import (
@@ -125,28 +123,6 @@ def test_resets_leave_a_policy_no_tick_behind(start_process: Start, tmp_path: Pa
             assert [m.data for m in first] == [m.data for m in second], number
 
 
-def test_every_command_of_a_burst_has_its_own_tick(start_process: Start) -> None:
-    sim = start_process(*SIM_NODE, *ros_args(mode='lockstep'))
-    with client(REACH) as robot:
-        robot.subscribe('applied_command', 'joint_states')
-        robot.connect('commands')
-        robot.spin_until(lambda: bool(robot.received['joint_states']), 'the reset')
-        applied = robot.received['applied_command']
-        # A command whose tick arrives shows that both directions are connected.
-        while not applied:
-            robot.command(0, 0, 0, 0)
-            robot.spin(0.3)
-        robot.spin(0.3)
-        applied.clear()
-        sent = [0.125 * number for number in range(1, 8)]
-        for value in sent:
-            robot.command(value, 0, 0, 0)
-        robot.spin_until(lambda: len(applied) >= len(sent), 'a tick for each')
-        robot.spin(0.3)
-        assert [message.data[0] for message in applied] == sent
-    end(sim)
-
-
 def test_commander_comes_late_dies_and_returns(start_process: Start) -> None:
     sim = start_process(*SIM_NODE, *ros_args(mode='lockstep'))
     with client(REACH) as robot:
@@ -176,42 +152,3 @@ def test_commander_comes_late_dies_and_returns(start_process: Start) -> None:
     output = end(sim)
     assert 'of episode' in output
     assert 'waits for a valid command; /policy_node sends none' in output
-
-
-def test_two_commanders_are_reported_and_health_is_published(start_process: Start) -> None:
-    sim = start_process(*SIM_NODE, *ros_args(real_time_factor=4.0))
-    policy = start_process(*POLICY_NODE, *ros_args(policy='random', use_sim_time=True))
-    with client(REACH) as robot:
-        robot.subscribe('/diagnostics', 'real_time_factor', 'policy_status', 'joint_states')
-        robot.connect('commands')
-
-        def message(node: str) -> str:
-            return robot.reports(node)[-1].message
-
-        robot.spin_until(lambda: '/client' in message('/sim_node'), 'a report')
-        assert '2 publish commands: /client, /policy_node' in message('/sim_node')
-        robot.command(0, 0, 0)
-        robot.spin_until(lambda: '1 commands rejected' in message('/sim_node'), 'the rejection')
-        assert robot.reports()[-1].level == b'\x01'
-        values = robot.values()
-        assert values['rejected: wrong size'] == values['commands rejected'] == '1'
-        assert values['log'] == 'off'
-        assert float(values['tick time p99 (ms)']) > 0.0
-        robot.spin_until(lambda: 'commands per second' in message('/policy_node'), 'a policy')
-        assert float(robot.values('/policy_node')['inference p50 (ms)']) > 0.0
-        # Both in wall time, though one node follows the simulated; who commands, in the robot's.
-        for each in robot.received['/diagnostics'][-2:]:
-            assert abs(message_stamp(each) - time.time_ns()) < 10e9
-        (introduction,) = robot.received['policy_status']
-        assert 0 < message_stamp(introduction) < robot.stamps('joint_states')[-1]
-        factors = robot.received['real_time_factor']
-        robot.spin_until(lambda: any(abs(m.data - 4.0) < 0.4 for m in factors), 'factor of 4')
-        robot.set_parameter('sim_node', 'real_time_factor', 0.1)
-        factors.clear()
-        robot.spin_until(lambda: any(abs(m.data - 0.1) < 0.05 for m in factors), 'factor of 0.1')
-    for process in (sim, policy):
-        process.send_signal(signal.SIGTERM)
-    code, output = finish(sim)
-    assert code == 0
-    assert '2 publish commands: /client, /policy_node' in output
-    assert finish(policy)[0] == 0

@@ -1,42 +1,21 @@
-"""Reports, log lines and late subscribers of a robot."""
+"""Reports and log lines of a robot."""
 
 from __future__ import annotations
 
-import re
 import signal
+import time
 from pathlib import Path
 
 from std_msgs.msg import Float64MultiArray
 
+from msgs_spec.codecs import message_stamp
 from msgs_spec.tasks import task_spec
 from msgs_spec.topics import QosSpec
+from node_runtime.diagnostics import COMMANDERS
 from node_runtime.ros import rclpy_profile
-from support.graph import POLICY_NODE, SIM_NODE, Start, client, end, episodes_in, ros_args
+from support.graph import POLICY_NODE, SIM_NODE, Start, client, end, episodes_in, finish, ros_args
 
 REACH = task_spec('FetchReach')
-
-
-def test_a_killed_policy_is_reported_in_real_time(start_process: Start) -> None:
-    sim = start_process(*SIM_NODE, *ros_args(wait_for_commands=True, real_time_factor=4.0))
-    policy = start_process(*POLICY_NODE, *ros_args(policy='resting'))
-    with client(REACH) as robot:
-        robot.subscribe('/diagnostics', 'reward')
-        robot.spin_until(lambda: len(robot.received['reward']) > 5, 'ticks')
-        policy.send_signal(signal.SIGKILL)
-        text = 'commands have stopped, the robot holds; /policy_node sends none'
-        robot.spin_until(
-            lambda: any(text in report.message for report in robot.reports()), 'warning'
-        )
-        assert robot.reports()[-1].level == b'\x01'
-        # A successor is one commander, though the graph remembers the first for 20 s.
-        successor = start_process(*POLICY_NODE, *ros_args(policy='resting'))
-        robot.spin_until(lambda: 'stopped' not in robot.reports()[-1].message, 'commands')
-        assert 'publish commands' not in robot.reports()[-1].message
-        assert robot.values()['commanders'] == '/policy_node'
-    output = end(sim)
-    assert output.count(text) == 1
-    assert 'commands come from /policy_node' in output
-    end(successor)
 
 
 def test_episodes_after_an_actor_has_left_do_not_bear_its_name(
@@ -59,53 +38,81 @@ def test_episodes_after_an_actor_has_left_do_not_bear_its_name(
     assert not any(named[last + 2 :])
 
 
-def test_a_robot_without_a_log_prints_its_settings_and_episodes(start_process: Start) -> None:
-    arguments = ros_args(real_time_factor=0.0, episodes=2, seed=5, use_sim_time=True)
-    sim = start_process(*SIM_NODE, *arguments, '-r', '__ns:=/arm1')
-    output, errors = sim.communicate(timeout=30.0)
-    assert sim.returncode == 0, errors
-    use_sim_time, first, *episodes = (output + errors).strip().splitlines()
-    assert (
-        'use_sim_time is set back to false: sim_node itself publishes simulated time'
-        in use_sim_time
-    )
-    assert first.endswith(
-        'FetchReach, 25 ticks per simulated second, as fast as possible; topics in /arm1; '
-        'log: off; no commands yet'
-    )
-    assert [re.search(r'episode \d seed \d: 50 steps, return', line)[0] for line in episodes] == [
-        'episode 0 seed 5: 50 steps, return',
-        'episode 1 seed 6: 50 steps, return',
-    ]
-
-
-def test_two_robots_of_one_name_both_report_it(start_process: Start) -> None:
-    sims = [start_process(*SIM_NODE, *ros_args()) for _ in range(2)]
-    line = '2 nodes publish as one robot: /sim_node, /sim_node; give each its own namespace'
+def test_commanders_that_stop_or_disturb_and_health_are_reported(start_process: Start) -> None:
+    sim = start_process(*SIM_NODE, *ros_args(wait_for_commands=True, real_time_factor=4.0))
+    policy = start_process(*POLICY_NODE, *ros_args(policy='resting', use_sim_time=True))
     with client(REACH) as robot:
-        robot.subscribe('/diagnostics')
-        robot.spin_until(
-            lambda: sum(line in report.message for report in robot.reports()) > 2, 'errors'
-        )
-        assert all(each.level == b'\x02' for each in robot.reports() if line in each.message)
-        assert not any('publish_clock' in report.message for report in robot.reports())
-    assert [line in end(sim) for sim in sims] == [True, True]
+        robot.subscribe('/diagnostics', 'real_time_factor', 'policy_status', 'joint_states')
 
+        def wait_for(text: str, node: str = '/sim_node') -> None:
+            robot.spin_until(lambda: text in robot.reports(node)[-1].message, text)
 
-def test_publishers_that_the_robot_cannot_receive_are_reported(start_process: Start) -> None:
-    sim = start_process(*SIM_NODE, *ros_args(task='HandReach'))
-    lines = (
-        '/set_goal of /client is not received: its type is geometry_msgs/msg/PointStamped',
-        '/commands of /client is not received: it is best effort; allowed: reliable',
-    )
-    with client(REACH) as robot:
-        robot.subscribe('/diagnostics')
-        robot.publisher('set_goal')
+        robot.spin_until(lambda: len(robot.stamps('joint_states')) > 5, 'ticks')
+        # The policy introduces itself in the time of the robot.
+        (introduction,) = robot.received['policy_status']
+        assert 0 < message_stamp(introduction) < robot.stamps('joint_states')[-1]
+        policy.send_signal(signal.SIGKILL)
+        stopped = 'commands have stopped, the robot holds; /policy_node sends none'
+        wait_for(stopped)
+        assert robot.reports()[-1].level == b'\x01'
+        # A successor is one commander, though the graph remembers the first for 20 s.
+        successor = start_process(*POLICY_NODE, *ros_args(policy='resting', use_sim_time=True))
+        robot.spin_until(lambda: 'stopped' not in robot.reports()[-1].message, 'commands')
+        assert 'publish commands' not in robot.reports()[-1].message
+        assert robot.values()[COMMANDERS] == '/policy_node'
+
+        robot.connect('commands')
+        wait_for('2 publish commands: /client, /policy_node')
+        robot.command(0, 0, 0)
+        wait_for('1 commands rejected')
+        assert robot.reports()[-1].level == b'\x01'
+        values = robot.values()
+        assert values['rejected: wrong size'] == values['commands rejected'] == '1'
+        assert values['log'] == 'off'
+        assert float(values['tick time p99 (ms)']) > 0.0
+        wait_for('commands per second', '/policy_node')
+        assert float(robot.values('/policy_node')['inference p50 (ms)']) > 0.0
+        # Both in wall time, though one node follows the simulated.
+        for each in robot.received['/diagnostics'][-2:]:
+            assert abs(message_stamp(each) - time.time_ns()) < 10e9
         best_effort = rclpy_profile(QosSpec(1, 'best_effort', 'volatile'))
-        robot.node.create_publisher(Float64MultiArray, 'commands', best_effort)
-        robot.spin_until(
-            lambda: any(all(line in each.message for line in lines) for each in robot.reports()),
-            'both lines',
-        )
-    output = end(sim)
-    assert all(line in output for line in lines)
+        for name in ('commands', 'set_goal'):
+            robot.node.create_publisher(Float64MultiArray, name, best_effort)
+        unreceived = [
+            '/commands of /client is not received: it is best effort; allowed: reliable',
+            '/set_goal of /client is not received: its type is std_msgs/msg/Float64MultiArray',
+        ]
+        for line in unreceived:
+            wait_for(line)
+        factors = robot.received['real_time_factor']
+        robot.spin_until(lambda: any(abs(m.data - 4.0) < 0.4 for m in factors), 'factor of 4')
+        robot.set_parameter('sim_node', 'real_time_factor', 0.1)
+        factors.clear()
+        robot.spin_until(lambda: any(abs(m.data - 0.1) < 0.05 for m in factors), 'factor of 0.1')
+    for process in (sim, successor):
+        process.send_signal(signal.SIGTERM)
+    code, output = finish(sim)
+    assert code == 0
+    assert output.count(stopped) == 1
+    for line in ('commands come from /policy_node', '2 publish commands: /client', *unreceived):
+        assert line in output
+    assert finish(successor)[0] == 0
+
+
+def test_robots_of_one_name_and_a_second_clock_are_reported(start_process: Start) -> None:
+    sims = [start_process(*SIM_NODE, *ros_args(), '-r', f'__ns:={ns}') for ns in ('/', '/', '/b')]
+    same = '2 nodes publish as one robot: /sim_node, /sim_node; give each its own namespace'
+    clock = '/clock is also published by /sim_node; start all robots but one with publish_clock:='
+    with client(REACH) as robot:
+        robot.subscribe('/diagnostics')
+        for node, line in (('/sim_node', same), ('/b/sim_node', clock)):
+            robot.spin_until(
+                lambda: sum(line in each.message for each in robot.reports(node)) > 2,  # noqa: B023
+                'errors',
+            )
+            last = robot.reports(node)[-1]
+            assert last.level == b'\x02'
+            assert ('publish_clock' in last.message) == (line == clock)
+    assert [line in end(sim) for sim, line in zip(sims, (same, same, clock), strict=True)] == [
+        True
+    ] * 3

@@ -72,18 +72,12 @@ def test_what_a_running_robot_would_not_do_is_refused(start_process: Start, tmp_
 
 
 @pytest.mark.release
-def test_the_robot_is_in_the_namespace_of_ros_arguments(start_process: Start) -> None:
-    start_view(start_process, '--task', 'FetchReach', '--ros-args', '-r', '__ns:=/left')
-    with client(REACH) as connection:
-        for name in ('left/episode_status', 'left/policy_status'):
-            connection.spin_until(lambda name=name: connection.node.count_publishers(name), name)
-        assert not connection.node.count_publishers('episode_status')
-
-
-@pytest.mark.release
-def test_of_two_robots_one_publishes_the_clock(start_process: Start) -> None:
-    for robot, task in (('left', 'FetchReach'), ('right', 'HandReach')):
-        _, said = start_view(start_process, '--robot', robot, '--task', task)
+def test_of_two_robots_in_their_namespaces_one_publishes_the_clock(start_process: Start) -> None:
+    for robot, task, namespace in (
+        ('left', 'FetchReach', ('--ros-args', '-r', '__ns:=/left')),
+        ('right', 'HandReach', ('--robot', 'right')),
+    ):
+        _, said = start_view(start_process, '--task', task, *namespace)
         assert any('/clock comes from another' in line for line in said) == (robot == 'right')
         with client(REACH) as connection:
             connection.subscribe('/diagnostics')
@@ -94,6 +88,8 @@ def test_of_two_robots_one_publishes_the_clock(start_process: Start) -> None:
                 return len(reports) > 2 and connection.values(name)['clock publishers'] != '-'
 
             connection.spin_until(is_well, f'reports of {name}')
+            assert connection.values(name)['commanders'] == f'/{robot}/policy_node'
+            assert not connection.node.count_publishers('/episode_status')
             publishers = connection.node.get_publishers_info_by_topic('/clock')
             assert [each.node_namespace for each in publishers] == ['/left']
             for node in ('/left/sim_node', '/right/sim_node'):
