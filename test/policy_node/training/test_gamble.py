@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import torch
 
 from policy_node.policies.network_shape import NetworkShape
 from policy_node.training.experience.replay import Episodes, has_moved
@@ -83,36 +82,25 @@ def two_armed_gambles(count: int, generator: np.random.Generator) -> Episodes:
     return Episodes(observation, achieved, goal, action)
 
 
-def learnt_values(importance: str) -> dict[str, float]:
-    """Return the learnt values of both arms, for a goal that only gambling reaches."""
+@pytest.mark.release
+def test_weights_take_back_what_hindsight_does() -> None:
+    """Of goals that a gamble reaches, two thirds are chosen in hindsight; of others, none."""
     generator = np.random.default_rng(0)
-    learner = make_learner(NetworkShape(10, 3, 1, (64, 64)), gamma=0.0, importance=importance)
-    episodes = two_armed_gambles(2_000, generator)
+    learner = make_learner(NetworkShape(10, 3, 1, (64, 64)), gamma=0.0, importance='density')
     sampler = TransitionSampler(
         lambda achieved, goal: -1.0 * (np.abs(achieved - goal).max(axis=-1) > 0.5), gamma=0.0
     )
-    for _ in range(500):
-        row = generator.integers(len(episodes), size=256)
+    for _ in range(1500):
+        episodes, row = two_armed_gambles(256, generator), np.arange(256)
         batch = sampler.sample(episodes, row, {'future': 0.5, 'real': 0.5}, generator)
-        learner.update(batch)
-    features = learner.actor.features(
-        torch.tensor(batch.observation[:1]), torch.tensor([[3.0, 0.0, 0.0]])
-    )
-    with torch.no_grad():
-        return {
-            name: float(learner.critic(features, torch.tensor([[action]])))
-            for name, action in (('gamble', 1.0), ('walk', -1.0))
-        }
-
-
-@pytest.mark.release
-def test_weights_take_back_what_hindsight_does() -> None:
-    """In truth a gamble reaches a goal once in five times: its value is -0.8."""
-    biased, weighted = (learnt_values(kind) for kind in ('none', 'density'))
-    # Half of the gambles that go with this goal were chosen in hindsight: (0 - 0.8) / 2.
-    assert biased['gamble'] == pytest.approx(-0.4, abs=0.15)
-    assert weighted['gamble'] == pytest.approx(-0.8, abs=0.15)
-    assert weighted['walk'] == pytest.approx(-1.0, abs=0.1)
+        weight = learner.importance(batch)
+    gambled, reached = batch.action[:, 0] > 0, batch.reward == 0.0
+    for chosen, wanted in ((gambled & reached, 1 / 3), (gambled & ~reached, 2), (~gambled, 1)):
+        assert weight[chosen].mean() == pytest.approx(wanted, rel=0.15)
+    known = learner.tensors(batch)
+    error = learner.critic(known.features, known.action).detach().numpy() - batch.reward
+    weighted = (weight * np.square(error)).mean()
+    assert learner.update(batch).critic.item() == pytest.approx(weighted, rel=0.02)
 
 
 def test_a_landing_is_no_motion_of_the_robot() -> None:

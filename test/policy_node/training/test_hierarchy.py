@@ -2,37 +2,27 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 import torch
 
 from fetch_hand_sim.simulation import Simulation
-from policy_node import load_policy
 from policy_node.policies.actor import Actor
 from policy_node.policies.network_shape import NetworkShape
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.flat import from_flat
 from policy_node.training.configuration.recipes import recipe_config
-from policy_node.training.experience.replay import Episodes
-from policy_node.training.experience.sampling import TransitionSampler
+from policy_node.training.experience.replay import Episodes, Transitions
 from policy_node.training.machine import Workers
 from policy_node.training.research.hierarchy import (
-    LOW_SOURCES,
     TESTED,
-    GuidedCollector,
     GuidedPolicy,
     HierarchicalDDPG,
-    HierarchicalExperience,
     Proposer,
     SubgoalSampler,
     with_subgoals,
 )
 from policy_node.training.research.registry import make_collector
-from policy_node.training.runs.run_log import RunLog, read_progress
-from support.runs import STATE, resumed, same, trainer_of, weights
 
 CPU = torch.device('cpu')
 
@@ -43,88 +33,31 @@ def configured(**changes: object) -> TrainConfig:
     return recipe_config('FetchReach', 'best', **{**quick, 'subgoal_every': 10, **changes})
 
 
-def reached(achieved: np.ndarray, goal: np.ndarray) -> np.ndarray:
-    return -1.0 * (np.abs(achieved - goal)[..., 0] > 0.1)
-
-
-def make_generator() -> np.random.Generator:
-    return np.random.default_rng(0)
-
-
-class Line:
-    """Simulations of a point on a line, by a tenth a tick, with goals up to 1.5 away."""
-
-    def __init__(self, num_envs: int) -> None:
-        sizes = {'observation_size': 1, 'episode_ticks': 30, 'has_object': False}
-        goal, robot = SimpleNamespace(size=1), SimpleNamespace(action_size=1)
-        self.spec = SimpleNamespace(goal=goal, robot=robot, **sizes)
-        self.num_envs, self.generator = num_envs, make_generator()
-
-    def _seen(self) -> dict[str, np.ndarray]:
-        return {
-            'observation': self.place,
-            'achieved_goal': self.place,
-            'desired_goal': self.goal,
-        }
-
-    def reset(self, seed: object = None) -> dict[str, np.ndarray]:
-        self.place = np.zeros((self.num_envs, 1))
-        self.goal = self.generator.uniform(-1.5, 1.5, (self.num_envs, 1))
-        return self._seen()
-
-    def step(self, action: np.ndarray) -> SimpleNamespace:
-        self.place = self.place + 0.1 * np.clip(action, -1, 1)
-        success = reached(self.place, self.goal) == 0.0
-        never = np.zeros(self.num_envs, np.bool_)
-        return SimpleNamespace(observation=self._seen(), success=success, diverged=never)
-
-
-@pytest.mark.release
-def test_both_levels_learn_a_line_together() -> None:
-    """Episodes are collected through subgoals; goals are reached with and without them."""
-    torch.manual_seed(0)
-    changes = {'num_envs': 32, 'batch_size': 256, 'gamma': 0.95, 'goal_features': 'plain'}
-    changes |= {'noise_std': 0.2, 'random_epsilon': 0.3}
-    config, line, generator = configured(**changes), Line(32), make_generator()
-    learner = HierarchicalDDPG(NetworkShape(1, 1, 1, (64, 64)), config, CPU, Workers())
-    sampler = TransitionSampler(reached, config.tick_gamma, sources=LOW_SOURCES)
-    experience = HierarchicalExperience(config, line.spec, Workers(), sampler, generator, 2)
-    collector = GuidedCollector(line, [0] * 32, config)
-    for cycle in range(20):
-        policy = learner.acting_policy()
-        assert isinstance(policy, GuidedPolicy) == (cycle > 0), 'no proposals before learning'
-        episodes, _ = collector.collect(policy)
-        experience.replay.add(episodes)
-        experience.normalize(episodes, learner.actor)
-        for _ in range(40):
-            learner.update(experience.batch(0))
-        learner.average()
-    alone, proposer = learner.evaluation_actor(), learner.high.proposer(averaged=True)
-    for policy in (alone, GuidedPolicy(alone, proposer, 10, 30)):
-        observation = line.reset()
-        for _ in range(30):
-            result = line.step(policy.predict(observation)[0])
-            observation = result.observation
-        assert result.success.mean() > 0.9
-
-
-@pytest.mark.release
-def test_a_run_goes_on_where_it_stopped_and_saves_an_actor_like_any_other(tmp_path: Path) -> None:
-    trainer = trainer_of(tmp_path, subgoal_every=10, total_steps=1_200)
-    log = RunLog(tmp_path, 1_200, 0.0)
-    trainer.train(log)
-    log.close()
-    rows = read_progress(tmp_path / 'progress.csv')
-    assert [row['eval_guided'] for row in rows if 'eval_success' in row]
-    assert all(('eval_guided' in row) == ('eval_success' in row) for row in rows)
-    assert any(name.startswith('high_actor_optimizer.') for name in weights(tmp_path / STATE))
-    again = resumed(tmp_path, subgoal_every=10, total_steps=1_600)
-    assert same(*(each.learner.modules()['high_critic'].state_dict() for each in (trainer, again)))
-    assert again.train() == '1,600 environment steps done'
-    assert again.learner.high.updates == again.learner.updates == 16
-    loaded = load_policy(tmp_path / 'best.safetensors', 'FetchReach')
-    state = {'observation': np.zeros(10), 'achieved_goal': np.zeros(3), 'desired_goal': np.ones(3)}
-    assert loaded.policy.predict(state)[0].shape == (4,)
+@torch.no_grad()
+def test_the_high_level_proposes_and_learns_goals_on_the_same_scale() -> None:
+    config = configured(actor_average=0.75, final_learning_rate=0.1)
+    learner = HierarchicalDDPG(NetworkShape(1, 1, 1, (8,)), config, CPU, Workers())
+    assert isinstance(learner.acting_policy(), Actor), 'no proposals before learning'
+    assert learner.other_policies() == {}
+    learner.updates = 1
+    learner.actor.goal_normalizer.mean.fill_(2.0)
+    learner.actor.goal_normalizer.std.fill_(0.5)
+    for network, bias in ((learner.high.actor.network, 1.0), (learner.high.average_actor, 0.0)):
+        network.output.weight.zero_()
+        network.output.bias.fill_(bias)
+    learner.average()
+    zero = np.zeros((2, 1), np.float32)
+    state = {'observation': zero, 'desired_goal': zero}
+    (averaged,) = learner.other_policies().values()
+    for policy, bias in ((learner.acting_policy(), 1.0), (averaged, 0.25)):
+        assert isinstance(policy, GuidedPolicy)
+        goals = policy.proposer.goals(policy.proposer.normalized(state))
+        np.testing.assert_allclose(goals, 2.0 + 0.5 * 5.0 * np.tanh(bias), rtol=1e-5)
+        batch = Transitions(zero, zero, zero, goals, zero[:, 0], zero[:, 0])
+        np.testing.assert_allclose(learner.high.tensors(batch).action, np.tanh(bias), rtol=1e-5)
+    learner.set_progress(1.0)
+    rates = [optimizer.param_groups[0]['lr'] for optimizer in learner.optimizers().values()]
+    assert rates == pytest.approx([0.1 * config.learning_rate] * 4)
 
 
 class Constant:

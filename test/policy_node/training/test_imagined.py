@@ -12,7 +12,6 @@ from policy_node.training.configuration.recipes import recipe_config
 from policy_node.training.experience.replay import Transitions
 from policy_node.training.learners.imagined import ImaginingDDPG
 from policy_node.training.machine import Workers
-from support.runs import resumed, same, trained
 
 SHAPE = NetworkShape(10, 3, 4, (64, 64))
 
@@ -100,14 +99,6 @@ def test_the_network_that_imagines_learns_at_its_interval():
         now = list(learner.imagination.parameters())
         learnt.append(not all(torch.equal(*pair) for pair in zip(before, now, strict=True)))
     assert learnt == [True, False, False, True, False, False, True]
-
-
-@pytest.mark.release
-def test_a_run_goes_on_where_it_stopped(tmp_path):
-    first = trained(tmp_path, total_steps=800, subgoal_prior=0.3)
-    again = resumed(tmp_path, total_steps=1_200, subgoal_prior=0.3)
-    assert same(*(each.learner.modules()['imagination'].state_dict() for each in (first, again)))
-    assert again.train() == '1,200 environment steps done'
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import fields
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -27,7 +26,6 @@ from policy_node.training.research.rollouts import (
     decision_weights,
     goals_in_hindsight,
 )
-from support.runs import resumed, trained
 
 ON_POLICY = {'algorithm': 'ppo', 'overlap': False, 'random_epsilon': 0.0, 'noise_std': 0.3}
 
@@ -324,20 +322,3 @@ def test_probabilities_that_float32_cannot_compare_ruin_no_network(
         assert torch.isfinite(losses.actor)
     for value in learner.actor.state_dict().values():
         assert torch.isfinite(value).all()
-
-
-@pytest.mark.parametrize(
-    'changes',
-    [
-        {},
-        pytest.param({'importance': 'decision'}, marks=pytest.mark.release),
-        pytest.param({'goals': 'outcome=.8', 'first_value': -50.0}, marks=pytest.mark.release),
-    ],
-    ids=['taken', 'weighed', 'outcomes'],
-)
-def test_a_run_of_ppo_goes_on_where_it_stopped(changes: dict[str, object], tmp_path: Path) -> None:
-    trained(tmp_path, total_steps=800, **ON_POLICY, **changes)
-    trainer = resumed(tmp_path, total_steps=1_600, **ON_POLICY, **changes)
-    assert trainer.counters.updates == 2 * 4
-    assert trainer.train() == '1,600 environment steps done'
-    assert trainer.counters.updates == 4 * 4 and (tmp_path / 'best.safetensors').is_file()

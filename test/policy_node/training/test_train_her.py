@@ -13,6 +13,7 @@ import torch
 
 from fetch_hand_sim.simulation import Simulation
 from msgs_spec.tasks import task_spec
+from policy_node import load_policy
 from policy_node.policies import checkpoint
 from policy_node.policies.policy import RandomPolicy
 from policy_node.training.evaluation import EpisodeOutcomes
@@ -20,10 +21,11 @@ from policy_node.training.experience.episode_files import read_experience
 from policy_node.training.experience.rewards import GradedReward
 from policy_node.training.generate_episodes import main as generate_episodes
 from policy_node.training.runs.run import train_run
-from policy_node.training.runs.run_log import read_progress
+from policy_node.training.runs.run_log import RunLog, read_progress
 from policy_node.training.runs.training_state import TrainingError, read_state
 from policy_node.training.ship_actor import main as ship_actor
 from policy_node.training.train_her import main
+from support.fresh_actor import observations
 from support.runs import (
     SMALL,
     STATE,
@@ -38,7 +40,9 @@ from support.runs import (
 )
 
 THREADS = ['--threads', '1', '--torch-threads', '1']
-PPO = ['--algorithm', 'ppo', '--no-overlap', '--random-epsilon', '0']
+ON_POLICY = {'algorithm': 'ppo', 'overlap': False, 'random_epsilon': 0.0, 'noise_std': 0.3}
+PPO = ' '.join(options_of(**ON_POLICY))
+REACH = task_spec('FetchReach')
 # A run of seconds: 8 simulations, 3 cycles.
 RUN = ['--task', 'FetchReach', '--steps', '1200', *options_of(**SMALL)]
 
@@ -87,20 +91,42 @@ def test_the_latest_actor_is_the_averaged_one_that_evaluations_measure(tmp_path)
     assert torch.equal(latest.network.state_dict()[name], state[f'average_actor.{name}'])
 
 
-def test_a_training_state_restores_everything(tmp_path):
-    first = trained(tmp_path, total_steps=1200)
-    second = trainer_of(tmp_path, total_steps=1200, seed=9)
+@pytest.mark.parametrize(
+    ('changes', 'kept'),
+    [
+        ({}, 'critic_optimizer.0.exp_avg'),
+        (ON_POLICY, 'critic_optimizer.0.exp_avg'),
+        pytest.param(
+            ON_POLICY | {'importance': 'decision'}, 'actor_optimizer.', marks=pytest.mark.release
+        ),
+        pytest.param(
+            ON_POLICY | {'goals': 'outcome=.8', 'first_value': -50.0},
+            'actor_optimizer.',
+            marks=pytest.mark.release,
+        ),
+        pytest.param({'subgoal_prior': 0.3}, 'imagination', marks=pytest.mark.release),
+        pytest.param({'subgoal_every': 10}, 'high_actor_optimizer.', marks=pytest.mark.release),
+    ],
+)
+def test_a_run_of_every_learner_goes_on_where_it_stopped(tmp_path, changes, kept):
+    first = trained(tmp_path, total_steps=1200, **changes)
+    saved = weights(tmp_path / STATE)
+    assert any(name.startswith(kept) for name in saved)
+    second = trainer_of(tmp_path, total_steps=1600, seed=9, **changes)
     fresh = second.collector.collect(second.learner.actor)[0]
     second.resume(tmp_path / STATE)
     assert second.counters == first.counters
+    second.save()
+    assert same(saved, weights(tmp_path / STATE))
     resumed = second.collector.collect(second.learner.actor)[0]
     assert (resumed.desired_goal != fresh.desired_goal).all(), 'episodes would come twice'
-    second.save()
-    tensors = weights(tmp_path / STATE)
-    assert any(name.startswith('critic_optimizer.0.exp_avg') for name in tensors)
-    first.save()
-    again = weights(tmp_path / STATE)
-    assert all(torch.equal(tensors[name], again[name]) for name in again)
+    log = RunLog(tmp_path, 1600, 0.0)
+    assert second.train(log) == '1,600 environment steps done'
+    log.close()
+    assert getattr(second.learner, 'high', second.learner).updates == second.counters.updates == 16
+    (row,) = read_progress(tmp_path / 'progress.csv')
+    assert 'eval_success' in row and ('eval_guided' in row) == ('subgoal_every' in changes)
+    assert load_policy(tmp_path / 'best.safetensors').predict(observations(REACH))[0].shape == (4,)
 
 
 @pytest.fixture(scope='module')
@@ -127,7 +153,7 @@ def test_logged_episodes_are_learnt_from_before_any_step(tmp_path, logged, capsy
 
 
 def test_workers_share_logged_episodes_and_a_resumed_run_counts_them_once(tmp_path, logged):
-    episodes, _ = read_experience(logged, task_spec('FetchReach'))
+    episodes, _ = read_experience(logged, REACH)
     statistics = 'observation_statistics'
     before = trained(tmp_path, total_steps=400).experience.statistics[statistics].state_dict()
     again = resumed(tmp_path)
@@ -338,7 +364,7 @@ def test_two_workers_train_together(tmp_path):
         ('--task FetchReach --her --set strategy=none', '--her excludes strategy none'),
         ('--task FetchReach --set gamma=.9 --gamma .95', '--gamma 0.95 excludes --set gamma=0.9'),
         ('--task FetchReach --replay-transitions 1000 --learning-starts 1001', '1001 or more'),
-        (f'{" ".join(PPO)} --task FetchReach --from-episodes .', 'ppo excludes --from-episodes'),
+        (f'{PPO} --task FetchReach --from-episodes .', 'ppo excludes --from-episodes'),
         ('--resume nowhere', 'nowhere is not the folder of a run'),
     ],
 )
