@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import os
 import re
-import shlex
 import shutil
 import stat
 import subprocess
@@ -16,6 +14,8 @@ from pathlib import Path
 import pytest
 
 from support import ROOT
+from support.entry_points import console_scripts
+from support.graph import finish
 
 PACKAGE = 'fetch_hand_sim'
 PYTHON_PACKAGES = ('msgs_spec', 'node_runtime', 'fetch_hand_sim', 'policy_node')
@@ -67,36 +67,9 @@ def prefix(workspace):
     return workspace / 'install' / PACKAGE
 
 
-@pytest.fixture
-def in_install(workspace, ros_environment):
-    """Returns the command that runs a line of shell with the workspace sourced.
-
-    The installed scripts start `/usr/bin/env python3`, so the environment comes first on the path,
-    as it does for a user who activated it.
-    """
-    path = f'{BIN}{os.pathsep}{ros_environment["PATH"]}'
-    setup = shlex.quote(str(workspace / 'install' / 'setup.sh'))
-    return lambda line: ['env', f'PATH={path}', 'sh', '-c', f'. {setup} && exec {line}']
-
-
-@pytest.fixture(scope='module')
-def distribution(prefix):
-    """The installed metadata of setup.py."""
-    (site_packages,) = prefix.glob('lib/python3*/site-packages')
-    (found,) = importlib.metadata.distributions(name=PACKAGE, path=[str(site_packages)])
-    return found
-
-
-@pytest.fixture(scope='module')
-def executables(distribution):
-    """The names of the executables setup.py declares."""
-    return {point.name for point in distribution.entry_points.select(group='console_scripts')}
-
-
-def test_every_executable_is_where_ros2_run_looks(prefix, executables):
+def test_every_executable_is_where_ros2_run_looks(prefix):
     folder = prefix / 'lib' / PACKAGE
-    assert executables >= {'sim_node', 'policy_node'}
-    assert {path.name for path in folder.iterdir()} == executables
+    assert {path.name for path in folder.iterdir()} == set(console_scripts())
     for path in folder.iterdir():
         assert path.stat().st_mode & stat.S_IXUSR, path
         # Not the interpreter of the build: the node needs the packages of the user's environment.
@@ -152,15 +125,18 @@ def test_colcon_test_collects_every_module(workspace):
     assert len(skipped) < 10
 
 
-def test_installed_sim_node_runs_an_episode(prefix, in_install, start_process, tmp_path):
+def test_installed_sim_node_runs_an_episode(
+    prefix, start_process, ros_environment, monkeypatch, tmp_path
+):
     """With the installed parameter file, as a user starts it, and as fast as it goes."""
+    # As for a user who activated the environment: scripts start `/usr/bin/env python3`.
+    monkeypatch.setitem(ros_environment, 'PATH', f'{BIN}{os.pathsep}{ros_environment["PATH"]}')
     line = (
-        f'{prefix}/lib/{PACKAGE}/sim_node --ros-args '
+        f'. {prefix.parent}/setup.sh && exec {prefix}/lib/{PACKAGE}/sim_node --ros-args '
         f'--params-file {prefix}/share/{PACKAGE}/config/sim_node.yaml '
         '-p task:=FetchReach -p episodes:=1 -p real_time_factor:=0.0 -p episode_dir:=episodes'
     )
-    node = start_process(*in_install(line), cwd=tmp_path)
-    output, errors = node.communicate(timeout=60)
-    assert node.returncode == 0, output + errors
+    code, output = finish(start_process('sh', '-c', line, cwd=tmp_path), 60.0)
+    assert code == 0, output
     (episode,) = (tmp_path / 'episodes').glob('FetchReach_*')
     assert {path.suffix for path in episode.iterdir()} == {'.mcap', '.yaml'}

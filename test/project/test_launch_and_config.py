@@ -16,40 +16,52 @@ from node_runtime.ros_parameters import declare_parameters
 from support import ROOT
 
 SPECS = {'sim_node': SIM_NODE, 'policy_node': POLICY_NODE}
-LAUNCH = ElementTree.parse(ROOT / 'launch' / 'demo.launch.xml').getroot()
-DEFAULTS = {arg.get('name'): arg.get('default') for arg in LAUNCH.findall('arg')}
-GROUPS = {group.find('node').get('exec'): group for group in LAUNCH.findall('group')}
+DEMO, VIEW = (
+    ElementTree.parse(ROOT / 'launch' / f'{name}.launch.xml').getroot() for name in ('demo', 'view')
+)
+GROUPS = {group.find('node').get('exec'): group for group in DEMO.findall('group')}
 SHARE = '$(find-pkg-share fetch_hand_sim)'
 
 
-def resolved(text: str, arguments: dict[str, str]) -> str:
-    """A value of the launch file, with its substitutions made."""
-    text = re.sub(r'\$\(var (\w+)\)', lambda match: (DEFAULTS | arguments)[match[1]], text)
+def values_of(launch: ElementTree.Element, **arguments: str) -> dict[str, str]:
+    """The arguments of a launch file, some of them given."""
+    return {arg.get('name'): arg.get('default') for arg in launch.findall('arg')} | arguments
+
+
+def resolved(text: str, values: dict[str, str]) -> str:
+    """A value of a launch file, with its substitutions made."""
+    text = re.sub(r'\$\(var (\w+)\)', lambda match: values[match[1]], text)
     return text.replace(SHARE, str(ROOT))
 
 
-def is_meant(action: ElementTree.Element, arguments: dict[str, str]) -> bool:
+def is_meant(action: ElementTree.Element, values: dict[str, str]) -> bool:
     """Evaluate `if`; these files only use `not-equals`."""
     condition = action.get('if')
     if condition is None:
         return True
-    (operands,) = re.findall(r'^\$\(not-equals (\S+ \S*)\)$', resolved(condition, arguments))
+    (operands,) = re.findall(r'^\$\(not-equals (\S+ \S*)\)$', resolved(condition, values))
     left, _, right = operands.partition(' ')
     return left != right
 
 
 def node_arguments(node: str, **arguments: str) -> list[str]:
     """The command line that ros2 launch makes of a group: its actions in their order."""
-    words = ['--ros-args']
+    words, values = ['--ros-args'], values_of(DEMO, **arguments)
     for action in GROUPS[node]:
-        if action.tag == 'node' or not is_meant(action, arguments):
+        if action.tag == 'node' or not is_meant(action, values):
             continue
         if action.tag == 'set_parameters_from_file':
-            words += ['--params-file', resolved(action.get('filename'), arguments)]
+            words += ['--params-file', resolved(action.get('filename'), values)]
         else:
-            value = resolved(action.get('value'), arguments)
-            words += ['-p', f'{action.get("name")}:={value}']
+            words += ['-p', f'{action.get("name")}:={resolved(action.get("value"), values)}']
     return words
+
+
+def given_by_view(**arguments: str) -> dict[str, str]:
+    """The arguments that view.launch.xml gives to demo.launch.xml."""
+    values = values_of(VIEW, **arguments)
+    given = VIEW.find('include').findall('arg')
+    return {arg.get('name'): resolved(arg.get('value'), values) for arg in given}
 
 
 def parameters_of(node: str, **arguments: str) -> dict[str, object]:
@@ -76,7 +88,7 @@ def test_without_arguments_the_demo_and_the_robot_for_the_page_wait_for_commands
     assert logged['episode_dir'] == 'there'
 
 
-def test_arguments_that_are_not_given_leave_a_params_file_as_it_is(tmp_path):
+def test_arguments_replace_a_params_file_and_both_replace_the_defaults(tmp_path):
     mine = {
         'task': 'FetchPush',
         'episodes': 2,
@@ -87,18 +99,20 @@ def test_arguments_that_are_not_given_leave_a_params_file_as_it_is(tmp_path):
     }
     path = tmp_path / 'my.yaml'
     path.write_text(yaml.safe_dump({'/**/sim_node': {'ros__parameters': mine}}))
-    values = parameters_of('sim_node', params_file=str(path))
-    assert {name: values[name] for name in mine} == mine
-    values = parameters_of('sim_node', params_file=str(path), task='HandReach', episodes='0')
-    assert {name: values[name] for name in mine} == mine | {'task': 'HandReach', 'episodes': 0}
-
-
-def test_every_argument_replaces_its_parameter():
-    given = {'task': 'HandReach', 'episodes': '7', 'mode': 'lockstep', 'episode_dir': 'there'}
-    values = parameters_of('sim_node', **given, publish_clock='false')
-    assert {name: str(values[name]) for name in given} == given
-    assert values['publish_clock'] is False
-    assert parameters_of('policy_node', task='HandReach')['task'] == 'HandReach'
+    given = {'task': 'HandReach', 'episodes': 0, 'mode': 'realtime', 'episode_dir': 'there'}
+    given |= {'publish_clock': True}
+    words = {name: str(value) for name, value in given.items()}
+    by_view = given_by_view(params_file=str(path), task='HandReach', episode_dir='there')
+    for arguments, wanted in (
+        ({}, mine),
+        (words, mine | given),
+        (given_by_view(params_file=str(path)), mine),
+        (by_view, mine | {'task': 'HandReach', 'episode_dir': 'there'}),
+    ):
+        values = parameters_of('sim_node', **{'params_file': str(path)} | arguments)
+        assert {name: values[name] for name in mine} == wanted
+    for arguments in (words, by_view):
+        assert parameters_of('policy_node', **arguments)['task'] == 'HandReach'
 
 
 def test_launch_files_start_installed_executables():
@@ -107,44 +121,24 @@ def test_launch_files_start_installed_executables():
         node = group.find('node')
         assert (node.get('pkg'), node.get('name')) == ('fetch_hand_sim', name)
         assert re.search(rf"'{name} = [\w.]+:main'", setup)
-        assert resolved(node.get('namespace'), {}) == ''
-    assert set(re.findall(r'\$\(var (\w+)\)', text)) == set(DEFAULTS)
-    assert set(DEFAULTS.values()) == {''}
-    assert all(arg.get('description') for arg in LAUNCH.findall('arg'))
-
-
-VIEW_LAUNCH = ElementTree.parse(ROOT / 'launch' / 'view.launch.xml').getroot()
-
-
-def resolved_by_view(text: str, values: dict[str, str]) -> str:
-    return re.sub(r'\$\(var (\w+)\)', lambda match: values[match[1]], text)
-
-
-def values_of_view(**arguments: str) -> dict[str, str]:
-    """The arguments of view.launch.xml."""
-    return {arg.get('name'): arg.get('default') for arg in VIEW_LAUNCH.findall('arg')} | arguments
-
-
-def given_by_view(**arguments: str) -> dict[str, str]:
-    """The arguments that view.launch.xml gives to demo.launch.xml."""
-    values = values_of_view(**arguments)
-    return {
-        arg.get('name'): resolved_by_view(arg.get('value'), values)
-        for arg in VIEW_LAUNCH.find('include').findall('arg')
-    }
+        assert resolved(node.get('namespace'), values_of(DEMO)) == ''
+    defaults = values_of(DEMO)
+    assert set(re.findall(r'\$\(var (\w+)\)', text)) == set(defaults)
+    assert set(defaults.values()) == {''}
+    assert all(arg.get('description') for arg in (*DEMO.findall('arg'), *VIEW.findall('arg')))
 
 
 def page_of_view(**arguments: str) -> argparse.Namespace:
     """The options with which view.launch.xml starts the page."""
-    values = values_of_view(**arguments)
+    values = values_of(VIEW, **arguments)
     (node,) = [
         node
-        for node in VIEW_LAUNCH.findall('node')
-        if resolved_by_view(node.get('if', 'true'), values) == 'true'
-        and resolved_by_view(node.get('unless', 'false'), values) == 'false'
+        for node in VIEW.findall('node')
+        if resolved(node.get('if', 'true'), values) == 'true'
+        and resolved(node.get('unless', 'false'), values) == 'false'
     ]
     assert (node.get('exec'), node.get('namespace')) == ('view', '$(var namespace)')
-    return parse(resolved_by_view(node.get('args'), values).split())
+    return parse(resolved(node.get('args'), values).split())
 
 
 def test_a_launched_page_is_local_and_may_command_by_default():
@@ -152,17 +146,6 @@ def test_a_launched_page_is_local_and_may_command_by_default():
     assert (page.host, page.port, page.read_only, page.wait) == ('127.0.0.1', 0, False, 60.0)
     page = page_of_view(host='0.0.0.0', port='8090', read_only='true')
     assert (page.host, page.port, page.read_only) == ('0.0.0.0', 8090, True)
-    assert all(arg.get('description') for arg in VIEW_LAUNCH.findall('arg'))
-
-
-def test_a_params_file_changes_only_its_own_parameters(tmp_path):
-    path = tmp_path / 'my.yaml'
-    path.write_text(yaml.safe_dump({'/**/sim_node': {'ros__parameters': {'task': 'FetchPush'}}}))
-    values = parameters_of('sim_node', **given_by_view(params_file=str(path)))
-    assert (values['task'], values['episodes'], values['episode_dir']) == ('FetchPush', 0, '')
-    values = parameters_of('sim_node', **given_by_view(params_file=str(path), task='HandReach'))
-    assert values['task'] == 'HandReach'
-    assert parameters_of('policy_node', **given_by_view(task='HandReach'))['task'] == 'HandReach'
 
 
 @pytest.mark.parametrize('node', SPECS)

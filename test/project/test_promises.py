@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator
-from importlib.metadata import distribution
 
 from gymnasium.envs.registration import registry
 
-from fetch_hand_sim.__main__ import COMMANDS, Command
 from fetch_hand_sim.gym_envs.registration import reference_ids
 from msgs_spec.parameters import NODES
 from msgs_spec.tasks import TASKS
@@ -16,6 +14,7 @@ from msgs_spec.tick import PHASES, EpisodeStatus
 from msgs_spec.topics import MONITORING, SERVICES, topics
 from policy_node.training.configuration.config import FIELDS
 from support import ROOT
+from support.entry_points import console_scripts, leaves
 
 # One promise per line, written by `write` when 1.0 was released. Lines may be added, never changed.
 PROMISED = ROOT / 'test' / 'data' / 'promises_1_0.txt'
@@ -39,19 +38,12 @@ def present() -> Iterator[str]:
         yield from (f'parameter {node}: {p.name} {p.type} {p.default!r}' for p in parameters)
     yield from (f'episode_status: {field.name}' for field in dataclasses.fields(EpisodeStatus))
     yield from (f'phase: {phase}' for phase in PHASES)
-    yield from (f'command line: {words}' for words in command_lines(COMMANDS))
-    scripts = distribution('fetch_hand_sim').entry_points.select(group='console_scripts')
-    yield from (f'executable: {script.name}' for script in scripts)
+    paths = [path[:depth] for path, _ in leaves() for depth in range(1, len(path) + 1)]
+    yield from (f'command line: {" ".join(path)}' for path in paths)
+    yield from (f'executable: {name}' for name in console_scripts())
     yield from (f'training field: {name}' for name in FIELDS)
     own = (name for name in registry if name.startswith('fetch_hand_sim/'))
     yield from (f'environment: {name}' for name in (*own, *reference_ids()))
-
-
-def command_lines(commands: dict[str, Command], before: str = '') -> Iterator[str]:
-    """The commands of the one command, with what comes before each."""
-    for name, command in commands.items():
-        yield f'{before}{name}'
-        yield from command_lines(command.commands, f'{before}{name} ')
 
 
 def test_every_promised_name_exists() -> None:
