@@ -6,39 +6,24 @@ import re
 from functools import cache
 from pathlib import Path
 
-from support import ROOT
+from support import PACKAGES, ROOT
 
-PACKAGES = ('msgs_spec', 'node_runtime', 'fetch_hand_sim', 'policy_node')
-
-
-def folders() -> dict[str, list[Path]]:
-    """The modules of every folder of the packages, without `__init__` and `__main__`."""
-    found: dict[str, list[Path]] = {}
-    for package in PACKAGES:
-        for path in sorted((ROOT / package).rglob('*.py')):
-            modules = found.setdefault(f'{path.parent.relative_to(ROOT)}/', [])
-            if path.stem not in ('__init__', '__main__'):
-                modules.append(path)
-    return found
+FOLDERS = (*PACKAGES, 'bench', 'examples', 'test', 'tools')
 
 
 def test_the_architecture_page_lists_every_folder_once() -> None:
     page = (ROOT / 'docs' / 'architecture.md').read_text()
-    assert sorted(re.findall(r'^\| `([\w/]+/)` \|', page, flags=re.MULTILINE)) == sorted(folders())
-
-
-# Pages
+    modules = [path for package in PACKAGES for path in (ROOT / package).rglob('*.py')]
+    folders = {f'{path.parent.relative_to(ROOT)}/' for path in modules}
+    listed = re.findall(r'^\| `([\w/]+/)` \|', page, flags=re.MULTILINE)
+    assert sorted(listed) == sorted(folders)
 
 
 def pages() -> list[Path]:
     """The documentation, without history: the changelog and the lab notes."""
-    docs = [page for page in pages_of_docs() if 'lab_notes' not in page.parts]
-    return sorted([ROOT / 'README.md', ROOT / 'CONTRIBUTING.md', *docs])
-
-
-def pages_of_docs() -> list[Path]:
-    """All pages in `docs`, also the lab notes."""
-    return sorted(path for path in (ROOT / 'docs').rglob('*.md') if path.parent.name != 'generated')
+    docs = (path for path in (ROOT / 'docs').rglob('*.md') if path.parent.name != 'generated')
+    current = (page for page in docs if 'lab_notes' not in page.parts)
+    return sorted([ROOT / 'README.md', ROOT / 'CONTRIBUTING.md', *current])
 
 
 def lost_files(page: str) -> list[str]:
@@ -52,9 +37,6 @@ def tree() -> list[str]:
     """The Python files of the repository."""
     files = [path.relative_to(ROOT) for name in FOLDERS for path in (ROOT / name).rglob('*.py')]
     return ['/setup.py', *(f'/{path}' for path in files)]
-
-
-FOLDERS = (*PACKAGES, 'bench', 'examples', 'test', 'tools')
 
 
 def test_files_named_by_pages_and_package_docstrings_exist() -> None:

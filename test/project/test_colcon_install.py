@@ -18,7 +18,6 @@ from support.entry_points import console_scripts
 from support.graph import finish
 
 PACKAGE = 'fetch_hand_sim'
-PYTHON_PACKAGES = ('msgs_spec', 'node_runtime', 'fetch_hand_sim', 'policy_node')
 BIN = Path(sys.prefix) / 'bin'
 
 # It builds the package; test_packages.py checks the same files in the wheel.

@@ -19,7 +19,7 @@ from msgs_spec.topics import SERVICES, topics, view_topics
 from policy_node.policies.loading import shipped_actors
 from policy_node.training.configuration.config import FIELDS
 from policy_node.training.configuration.recipes import recipe_config
-from support import ROOT
+from support import PACKAGES, ROOT
 
 INTERFACE, README, REFERENCE, TASK_PAGES = (
     runpy.run_path(str(ROOT / 'tools' / f'{name}.py'))
@@ -101,7 +101,7 @@ def test_a_command_is_shown_with_its_help() -> None:
 
 def constructors() -> Iterator[tuple[str, str]]:
     """Yield each class with its place and the docstring of its `__init__`."""
-    for package in ('msgs_spec', 'node_runtime', 'fetch_hand_sim', 'policy_node'):
+    for package in PACKAGES:
         for path in (ROOT / package).rglob('*.py'):
             for node in ast.walk(ast.parse(path.read_text())):
                 for method in node.body if isinstance(node, ast.ClassDef) else ():

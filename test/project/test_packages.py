@@ -15,9 +15,9 @@ import grimp
 import pytest
 import yaml
 from catkin_pkg.package import parse_package
-from test_colcon_install import PYTHON_PACKAGES, tracked_files
+from test_colcon_install import tracked_files
 
-from support import ROOT
+from support import PACKAGES, ROOT
 
 # Generated or of use in a checkout alone.
 NOT_IN_SDIST = (
@@ -78,7 +78,7 @@ def test_the_wheel_holds_the_packages_and_nothing_else(wheel: zipfile.ZipFile) -
     wanted = {
         name
         for name in tracked_files()
-        if name.split('/')[0] in PYTHON_PACKAGES and not name.endswith('.training.safetensors')
+        if name.split('/')[0] in PACKAGES and not name.endswith('.training.safetensors')
     }
     assert names == wanted
 
@@ -107,7 +107,7 @@ def test_the_metadata_are_complete_and_the_base_installation_is_small(metadata) 
 
 def imported_packages() -> set[str]:
     """Top-level names of what the sources import, wherever in them."""
-    graph = grimp.build_graph(*PYTHON_PACKAGES, include_external_packages=True, cache_dir=None)
+    graph = grimp.build_graph(*PACKAGES, include_external_packages=True, cache_dir=None)
     return {name.partition('.')[0] for name in graph.modules}
 
 
@@ -119,7 +119,7 @@ def test_everything_that_is_imported_is_required(metadata) -> None:
     required = {re.match(r'[\w.-]+', each)[0].lower() for each in metadata.get_all('Requires-Dist')}
     missing = {
         name
-        for name in names & set(owners) - {*PYTHON_PACKAGES, *sys.stdlib_module_names}
+        for name in names & set(owners) - {*PACKAGES, *sys.stdlib_module_names}
         if not {each.lower().replace('_', '-') for each in owners[name]} & required
     }
     assert not missing

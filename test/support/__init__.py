@@ -9,6 +9,7 @@ from pathlib import Path
 
 SUPPORT = Path(__file__).resolve().parent
 ROOT = SUPPORT.parents[1]
+PACKAGES = ('msgs_spec', 'node_runtime', 'fetch_hand_sim', 'policy_node')
 
 
 def script_environment(environment: dict[str, str] | None = None) -> dict[str, str]:

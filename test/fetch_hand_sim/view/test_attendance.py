@@ -15,7 +15,7 @@ from fetch_hand_sim.simulation.scene import Frame
 from fetch_hand_sim.view import guard, live, robot_requests
 from fetch_hand_sim.view.guard import Attendance, Guard, guarded_serve
 from fetch_hand_sim.view.live import LiveRobot
-from fetch_hand_sim.view.requests import ReleaseGoal, SetCommanding, SetGoal
+from fetch_hand_sim.view.requests import ReleaseGoal, SetCommand, SetCommanding, SetGoal
 from fetch_hand_sim.view.robot_requests import RemoteNode
 from fetch_hand_sim.view.robot_watch import SeenTick
 from msgs_spec.tick import EpisodeStatus
@@ -88,12 +88,21 @@ def follow(robot, stamps=(), **changes):
         robot._on_tick(SeenTick(stamp, frame, -1.0, np.zeros(4), None))
 
 
-def test_commands_end_when_visitor_task_or_robot_are_gone(robot, monkeypatch):
+def test_commands_end_when_switched_off_and_when_visitor_task_or_robot_are_gone(
+    node, robot, monkeypatch
+):
     def facts_of_a_commander():
         robot.perform(SetCommanding(True))
         return robot.picture().facts
 
     follow(robot, [10])
+    assert facts_of_a_commander().is_commanding
+    robot.perform(SetCommand(np.ones(4)))
+    assert node.count_publishers('/commands') == 1
+    robot.perform(SetCommanding(False))
+    robot.perform(SetCommand(np.ones(4)))
+    assert node.count_publishers('/commands') == 0
+    assert not robot.picture().facts.is_commanding
     assert facts_of_a_commander().is_commanding
     robot.leave()
     facts = robot.picture().facts

@@ -50,6 +50,8 @@ class Window:
 @pytest.mark.parametrize('task', ['FetchPush', 'FetchSlide', 'HandManipulateBlockFull'])
 def test_the_object_is_taken_where_it_is_seen_and_follows_the_mouse(task):
     window = Window(task)
+    assert not window.begin_at(np.array([1.3, 0.7, 3.0])), 'nothing is there'
+    assert not window.drag.is_pulling
     assert window.begin_at(window.data.body(TASKS[task].object_name).xpos)
     assert window.drag.is_pulling
     ((body, still),) = pulls(window.model, window.drag.move((0.0, 0.0))) or (('', np.zeros(6)),)
@@ -87,12 +89,6 @@ def test_world_table_and_ghost_cannot_be_pulled(task):
     expected = 'robot0:gripper_link' if task.startswith('Fetch') else 'robot0:ffdistal'
     assert expected in names
     assert TASKS[task].object_name is None or TASKS[task].object_name in names
-
-
-def test_nothing_is_taken_beside_the_robot():
-    window = Window('FetchPush')
-    assert not window.begin_at(np.array([1.3, 0.7, 3.0]))
-    assert not window.drag.is_pulling
 
 
 @pytest.mark.parametrize('kind', ['other size', 'other state', 'nan'])

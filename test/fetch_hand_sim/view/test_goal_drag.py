@@ -22,13 +22,13 @@ VIEW = View((1.3, 0.75, 0.5), 1.8, 132.0, -20.0)
 ASPECT = 1.5
 
 
-def project(point, fovy=45.0):
+def project(point, view=VIEW, aspect=ASPECT):
     """Where a point appears, 0 ... 1 from the left and top: the inverse of `mouse_ray`."""
-    center = mouse_ray(VIEW, fovy, MousePlace(0.5, 0.5, ASPECT))
+    center = mouse_ray(view, 45.0, MousePlace(0.5, 0.5, aspect))
     offset = point - center.origin
     depth = offset @ center.forward
-    half = np.tan(np.radians(fovy) / 2.0)
-    x, y = offset @ center.right / depth / half / ASPECT, offset @ center.up / depth / half
+    half = np.tan(np.radians(45.0) / 2.0)
+    x, y = offset @ center.right / depth / half / aspect, offset @ center.up / depth / half
     return (x + 1.0) / 2.0, (1.0 - y) / 2.0
 
 
@@ -52,13 +52,6 @@ def test_rays_agree_with_the_camera_of_mujoco():
     np.testing.assert_allclose(ray.up, eyes[0].up, atol=1e-6)
     middle = (np.array(eyes[0].pos) + np.array(eyes[1].pos)) / 2.0
     np.testing.assert_allclose(ray.origin, middle, atol=1e-4)
-
-
-@pytest.mark.parametrize('seed', range(5))
-def test_a_point_under_the_mouse_is_on_its_ray(seed):
-    point = np.random.default_rng(seed).uniform([1.0, 0.5, 0.3], [1.6, 1.0, 0.8])
-    assert ray_at(point).distance_to(point) < 1e-9
-    assert ray_at(point).distance_to(point + 0.1) > 0.05
 
 
 def example_goal(spec):
@@ -88,17 +81,12 @@ def test_every_handle_can_be_taken_and_moves_only_its_own_part(task):
             np.testing.assert_array_equal(moved[others], goal[others])
 
 
-def test_nothing_is_taken_beside_the_goal():
-    spec = TASKS['FetchReach']
-    goal = example_goal(spec)
-    assert find_handle(spec, goal, ray_at(goal + np.array([0.0, 0.0, 0.2]))) is None
-
-
 @pytest.mark.parametrize('task', ['FetchPush', 'FetchSlide'])
 @pytest.mark.parametrize('name', [None, 'OfMyOwn'])
 def test_goals_on_the_table_stay_on_it(task, name):
     spec = replace(TASKS[task], name=name or task)
     goal = np.array([1.3, 0.7, 0.42])
+    assert find_handle(spec, goal, ray_at(goal + np.array([0.0, 0.0, 0.2]))) is None
     (handle,) = handles(spec, goal)
     place = np.array([1.2, 0.8, 0.42])
     moved = moved_goal(spec, goal, handle, ray_at(place), True, np.zeros(2))

@@ -14,8 +14,6 @@ from fetch_hand_sim.view.picture import Facts, Picture
 from fetch_hand_sim.view.requests import (
     ChooseActor,
     Push,
-    SetCommand,
-    SetCommanding,
     SetPaused,
     SetSpeed,
 )
@@ -41,20 +39,8 @@ class Desk:
     def tell(self, **changes):
         self.facts = replace(self.facts, **changes)
 
-    def perform(self, *requests):
-        for request in requests:
-            self.requests.perform(request, self.facts)
-
-    def values_sent(self, name, *requests):
-        """Values of the first message on a topic, and the message."""
-        source, received = topic(SPEC, name), []
-        subscribe(self.node, source, received.append)
-        self.perform(*requests)
-        end = time.monotonic() + 20.0
-        while not received:
-            assert time.monotonic() < end
-            rclpy.spin_once(self.node, timeout_sec=0.1)
-        return decode(source, received[0]), received[0]
+    def perform(self, request):
+        self.requests.perform(request, self.facts)
 
 
 @pytest.fixture
@@ -67,21 +53,18 @@ def test_a_push_stays_within_the_limit_of_the_robot(desk):
     assert desk.node.count_publishers('/perturb') == 0
     assert 'perturb_limit' in desk.facts.notice
     desk.tell(push_limit=10.0)
-    sent, message = desk.values_sent('perturb', Push('object0', WRENCH))
+    source, received = topic(SPEC, 'perturb'), []
+    subscribe(desk.node, source, received.append)
+    desk.perform(Push('object0', WRENCH))
+    end = time.monotonic() + 20.0
+    while not received:
+        assert time.monotonic() < end
+        rclpy.spin_once(desk.node, timeout_sec=0.1)
+    (message,) = received
+    sent = decode(source, message)
     assert message.header.frame_id == 'object0'
     np.testing.assert_allclose(sent, 0.2 * WRENCH, rtol=1e-6)
     assert np.linalg.norm(sent[:3]) <= 10.0
-
-
-def test_sliders_command_only_while_they_are_switched_on(desk):
-    values = np.array([0.1, 0.2, 0.3, -1.0])
-    desk.perform(SetCommand(values))
-    assert desk.node.count_publishers('/commands') == 0
-    sent, _ = desk.values_sent('commands', SetCommanding(True), SetCommand(values))
-    np.testing.assert_array_equal(sent, values)
-    desk.perform(SetCommanding(False), SetCommand(values))
-    assert desk.node.count_publishers('/commands') == 0
-    assert not desk.facts.is_commanding
 
 
 def test_a_node_that_does_not_answer_is_not_paused_and_replays_leave_nothing_behind(desk):
