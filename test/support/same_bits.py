@@ -12,7 +12,7 @@ def assert_same(first: Any, second: Any) -> None:
     if isinstance(first, dict):
         assert first.keys() == second.keys()
         first, second = [*first.values()], [second[name] for name in first]
-    if isinstance(first, list | tuple):
+    if isinstance(first, list | tuple) or (np.ndim(first) and first.dtype == object):
         for one, other in zip(first, second, strict=True):
             assert_same(one, other)
     else:

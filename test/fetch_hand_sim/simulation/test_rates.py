@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pickle
 
-import gymnasium
 import numpy as np
 import pytest
 
@@ -104,16 +103,3 @@ def test_environments_are_truncated_after_the_seconds_of_an_episode():
         *_, truncated, _ = env.step(np.zeros((2, 4), np.float32))
         ended.append(truncated.all())
     assert ended == [False] * 24 + [True]
-
-
-def test_an_id_may_be_registered_by_the_module_before_its_colon(tmp_path, monkeypatch):
-    (tmp_path / 'somebodys_ids.py').write_text(
-        "import gymnasium\ngymnasium.register('Somebodys-v0', 'gymnasium.envs.classic_control:"
-        "CartPoleEnv')\n"
-    )
-    monkeypatch.syspath_prepend(tmp_path)
-    try:
-        made = fetch_hand_sim.make('somebodys_ids:Somebodys-v0')
-        assert made.spec.id == 'Somebodys-v0'
-    finally:
-        gymnasium.registry.pop('Somebodys-v0', None)
