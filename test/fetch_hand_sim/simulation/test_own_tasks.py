@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from fetch_hand_sim.simulation import Simulation
-from fetch_hand_sim.simulation.models import asset_path
 from fetch_hand_sim.simulation.scene import Scene
 from fetch_hand_sim.simulation.tasks import hand_manipulate, registry
 from fetch_hand_sim.simulation.tasks.fetch import FETCH_CONFIGS
@@ -30,16 +29,6 @@ class BlockNear(HandManipulateTask):
         super().__init__(spec, batch, MANIPULATE_CONFIGS[BLOCK])
 
 
-def test_a_hand_task_of_another_name_is_the_same_physics():
-    spec = replace(TASKS[BLOCK], name='HandBlockNear', reference_id=None)
-    tasks = BlockNear(spec, BatchConfig()), HandManipulateTask(TASKS[BLOCK], BatchConfig())
-    generators = [np.random.default_rng(3)], [np.random.default_rng(3)]
-    ids = np.arange(1)
-    first, second = (t.reset(ids, g) for t, g in zip(tasks, generators, strict=True))
-    assert first.tobytes() == second.tobytes()
-    assert tasks[0].asset == tasks[1].asset == BlockNear.ASSET
-
-
 def test_a_model_of_its_own_is_the_one_that_is_simulated(monkeypatch):
     class Missing(HandReachTask):
         ASSET = '/nowhere/hand.xml'
@@ -59,36 +48,24 @@ def test_a_model_of_its_own_is_the_one_that_is_simulated(monkeypatch):
         registry.make_task('HandReach')
 
 
-def test_a_model_may_be_named_by_its_path(monkeypatch):
-    class Mine(HandReachTask):
-        ASSET = asset_path('hand/reach.xml')
-
-    monkeypatch.setitem(TASKS, 'Mine', replace(TASKS['HandReach'], name='Mine', reference_id=None))
-    monkeypatch.setattr(registry, 'third_party_simulation', lambda name: Mine)
-    simulation = Simulation('Mine')
-    simulation.reset(seed=0)
-    assert simulation.asset == Mine.ASSET
-    assert Scene('Mine').model.nq == simulation.model.nq
-
-
-def test_sensors_run_only_when_read_and_change_no_bit():
+def test_sensors_of_a_task_of_another_name_run_only_when_read_and_change_no_bit():
     class Touching(BlockNear):
         def __init__(self, spec, batch):
             super().__init__(spec, batch)
             self.touch = self.output('sensordata')
 
-    states = []
-    for kind in (Touching, BlockNear):
-        task = kind(TASKS[BLOCK], BatchConfig())
+    spec = replace(TASKS[BLOCK], name='HandBlockNear', reference_id=None)
+    touching = Touching(spec, BatchConfig())
+    tasks = touching, HandManipulateTask(TASKS[BLOCK], BatchConfig(), MANIPULATE_CONFIGS[BLOCK])
+    for task in tasks:
         task.reset(np.arange(1), [np.random.default_rng(0)])
         for _ in range(10):
             task.apply_commands(task.resting_commands() + 0.3)
             task.step()
-        states.append(task.batch.state.tobytes())
-        if isinstance(task, Touching):
-            assert task.touch.shape == (1, 29)
-            assert task.touch.any()
-    assert states[0] == states[1]
+    assert touching.touch.shape == (1, 29)
+    assert touching.touch.any()
+    assert tasks[0].batch.state.tobytes() == tasks[1].batch.state.tobytes()
+    assert tasks[0].asset == tasks[1].asset == BlockNear.ASSET
 
 
 def test_a_start_that_cannot_be_is_refused_instead_of_looked_for_for_ever(monkeypatch):

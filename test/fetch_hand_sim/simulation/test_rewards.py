@@ -33,8 +33,12 @@ def metric(task: str, success_rule='gymnasium', reward_type='sparse'):
     return GoalMetric(TASKS[task], success_rule, reward_type)
 
 
-def pose(position=(0.0, 0.0, 0.0), quaternion=IDENTITY) -> np.ndarray:
-    return np.concatenate([position, quaternion])
+def turned(angle: float, about=(0.0, 1.0, 0.0)) -> np.ndarray:
+    return quaternion_from_axis_angle(about, angle)
+
+
+def pose(x: float = 0.0, quaternion=IDENTITY) -> np.ndarray:
+    return np.array([x, 0.0, 0.0, *quaternion])
 
 
 @pytest.mark.parametrize('success_rule', ['gymnasium', 'paper'])
@@ -69,64 +73,44 @@ def test_any_batch_equals_the_single_call_bit_for_bit(task, reward_type, success
         assert (measure.reward(achieved, unknown) == -1.0).all()
 
 
+TURNED = turned(0.7, about=(1.0, 2.0, 3.0))
+TILTED = turned(0.4, about=(1.0, 0.0, 0.0))
+
+
 @pytest.mark.parametrize(
-    ('task', 'near', 'far'),
+    ('task', 'achieved', 'desired', 'dense', 'successes'),
     [
-        ('FetchPush', [0.03, 0.0, 0.03], [0.0, 0.051, 0.0]),
-        ('FetchPush', [0.05, 0.0, 0.0], [0.0501, 0.0, 0.0]),
+        ('FetchPush', [0.03, 0.0, 0.03], np.zeros(3), -0.03 * np.sqrt(2.0), (True, True)),
+        ('FetchPush', [0.0, 0.0501, 0.0], np.zeros(3), -0.0501, (False, False)),
+        # Norm over all coordinates 1.8 cm, mean distance 0.8 cm; the threshold is 1 cm.
+        ('HandReach', [0.008, 0.0, 0.0] * 5, np.zeros(15), -0.008 * np.sqrt(5.0), (False, True)),
+        ('HandManipulateEggRotate', pose(0.5, turned(0.09)), pose(), -0.09, (True, True)),
+        ('HandManipulateEggRotate', pose(0.0, turned(0.11)), pose(), -0.11, (False, False)),
+        ('HandManipulateBlockFull', pose(0.5), pose(), -5.0, (False, False)),
+        # Opposite quaternions are one rotation only in the paper.
+        ('HandManipulateBlockFull', pose(0, TURNED), pose(0, -TURNED), -2 * np.pi, (False, True)),
+        # The pen may turn about its axis.
         (
-            'HandManipulateEggRotate',
-            [0.5, 0.0, 0.0, *quaternion_from_axis_angle([0.0, 1.0, 0.0], 0.09)],
-            pose(quaternion=quaternion_from_axis_angle([0.0, 1.0, 0.0], 0.11)),
+            'HandManipulatePenRotate',
+            pose(0.0, quaternion_multiply(TILTED, turned(1.3, about=(0.0, 0.0, 1.0)))),
+            pose(0.0, TILTED),
+            0.0,
+            (True, True),
         ),
+        ('HandManipulatePenRotate', pose(), pose(0.0, TILTED), -0.4, (False, False)),
     ],
 )
-def test_goals_count_within_the_threshold(task, near, far):
-    goal = pose() if len(near) == 7 else np.zeros(3)
-    for rule in ('gymnasium', 'paper'):
-        assert metric(task, rule).reward([near, far], [goal, goal]).tolist() == [0.0, -1.0]
-    if len(near) == 3:
-        dense = metric(task, reward_type='dense').reward(near, goal)
-        assert dense == pytest.approx(-np.linalg.norm(near))
+def test_distances_and_thresholds_of_both_success_rules(task, achieved, desired, dense, successes):
+    for rule, is_success in zip(('gymnasium', 'paper'), successes, strict=True):
+        assert metric(task, rule).success(achieved, desired) == is_success
+        assert metric(task, rule).reward(achieved, desired) == is_success - 1.0
+    measured = metric(task, reward_type='dense').reward(achieved, desired)
+    assert measured == pytest.approx(dense, abs=1e-6)
 
 
-def test_fingertips_by_the_norm_of_all_or_by_their_mean_distance():
-    desired = np.zeros(15)
-    achieved = np.tile([0.008, 0.0, 0.0], 5)
-    # Norm over all coordinates 1.8 cm, mean distance 0.8 cm; the threshold is 1 cm.
-    assert not metric('HandReach').success(achieved, desired)
-    assert metric('HandReach', 'paper').success(achieved, desired)
-    dense = metric('HandReach', 'paper', 'dense').reward(achieved, desired)
-    assert dense == pytest.approx(-0.008)
-
-
-@pytest.mark.parametrize('task', ['HandManipulateBlockFull', 'HandManipulateEggRotate'])
-def test_opposite_quaternions_are_one_rotation_only_in_the_paper(task):
-    quaternion = quaternion_from_axis_angle([1.0, 2.0, 3.0], 0.7)
-    goals = pose(quaternion=quaternion), pose(quaternion=-quaternion)
-    assert not metric(task).success(*goals)
-    assert metric(task, reward_type='dense').reward(*goals) == pytest.approx(-2 * np.pi)
-    assert metric(task, 'paper').success(*goals)
-
-
-def test_rotate_tasks_ignore_the_position_and_full_tasks_do_not():
-    far = pose((0.5, 0.0, 0.0))
-    assert metric('HandManipulateBlockRotateXYZ').success(far, pose())
-    assert not metric('HandManipulateBlockFull').success(far, pose())
-    dense = metric('HandManipulateBlockFull', reward_type='dense').reward(far, pose())
-    assert dense == pytest.approx(-5.0)
-
-
-def test_the_pen_may_turn_about_its_axis_in_every_row_of_a_batch():
-    # The reference takes the angles of the first rows instead of the last axis (pull request 338).
-    tilt = quaternion_from_axis_angle([1.0, 0.0, 0.0], 0.4)
-    spun = quaternion_multiply(tilt, quaternion_from_axis_angle([0.0, 0.0, 1.0], 1.3))
-    achieved = np.stack([pose(quaternion=tilt), pose(quaternion=spun), pose()])
-    desired = np.stack([pose(quaternion=tilt)] * 3)
-    assert metric('HandManipulatePenRotate').success(achieved, desired).tolist()[0]
-    single = [metric('HandManipulatePenRotate').success(a, desired[0]) for a in achieved]
-    assert metric('HandManipulatePenRotate').success(achieved, desired).tolist() == single
-    assert not single[2]
+def test_at_the_threshold_the_reward_is_0_without_a_success():
+    goals, measure = ([0.05, 0.0, 0.0], np.zeros(3)), metric('FetchPush')
+    assert (measure.reward(*goals), measure.success(*goals)) == (0.0, False)
 
 
 @pytest.mark.parametrize('name', ['reward', 'success'])
@@ -168,7 +152,13 @@ def test_a_parameter_of_a_metric_of_its_own_outlives_changes_copies_and_pickles(
     mine = kind(spec, scale=0.5)
     goals = random_goals(spec, 5)
     wider = replace(spec, distance_threshold=0.1)
+    env = FetchHandEnv('FetchPush')
+    env.simulation.metric = mine
+    env.distance_threshold, env.reward_type = 0.2, 'dense'
+    assert env.distance_threshold == 0.2
     for other in (
+        env.simulation.metric,
+        copy.deepcopy(env).simulation.metric,
         mine.with_changes(spec=wider, reward_type='dense', success_rule='paper'),
         copy.copy(mine),
         copy.deepcopy(mine),
@@ -180,12 +170,3 @@ def test_a_parameter_of_a_metric_of_its_own_outlives_changes_copies_and_pickles(
     assert (changed.spec, mine.spec) == (wider, spec)
     with pytest.raises(ValueError, match="reward_type 'denser'"):
         mine.with_changes(reward_type='denser')
-
-
-def test_settings_of_an_environment_keep_the_parameter():
-    env = FetchHandEnv('FetchPush')
-    env.simulation.metric = Scaled(env.simulation.spec, scale=0.5)
-    env.distance_threshold = 0.2
-    env.reward_type = 'dense'
-    assert env.simulation.metric.scale == copy.deepcopy(env).simulation.metric.scale == 0.5
-    assert env.distance_threshold == 0.2
