@@ -14,7 +14,6 @@ from node_runtime.command_line import (
     CommandError,
     CommandParser,
     UsageError,
-    require_extra,
     run_command,
     say,
     whole_number,
@@ -57,27 +56,23 @@ def test_names_are_printed_with_escapes_and_other_errors_keep_their_traceback(ca
 
 
 @pytest.mark.parametrize(
-    ('number', 'code'), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)]
+    ('numbers', 'code', 'in_the_background'),
+    [
+        ([signal.SIGINT], 130, False),
+        ([signal.SIGTERM], 143, False),
+        ([signal.SIGHUP], 129, False),
+        # Shells let commands in the background ignore Ctrl-C.
+        ([signal.SIGINT, signal.SIGTERM], 143, True),
+    ],
 )
-def test_a_signal_is_acknowledged_and_ends_with_its_code_without_a_traceback(number, code):
-    process = run_script(TIDY)
+def test_a_signal_is_acknowledged_and_ends_with_its_code(numbers, code, in_the_background):
+    handler = signal.SIG_IGN if in_the_background else signal.SIG_DFL
+    process = run_script(TIDY, preexec_fn=lambda: signal.signal(signal.SIGINT, handler))
     assert process.stdout.readline() == 'begun\n'
-    process.send_signal(number)
+    for number in numbers:
+        process.send_signal(number)
     assert process.communicate(timeout=20) == ('tidied\n', 'tool: stopping\n')
     assert process.returncode == code
-
-
-def test_a_command_in_the_background_which_ignores_ctrl_c_tidies_at_sigterm():
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        process = run_script(TIDY)
-    finally:
-        signal.signal(signal.SIGINT, before)
-    process.stdout.readline()
-    process.send_signal(signal.SIGINT)
-    process.send_signal(signal.SIGTERM)
-    assert process.communicate(timeout=20) == ('tidied\n', 'tool: stopping\n')
-    assert process.returncode == 143
 
 
 def test_a_second_ctrl_c_ends_a_command_that_tidies_for_ever():
@@ -169,18 +164,6 @@ def test_a_closed_terminal_ends_only_the_progress_bar():
     os.close(terminal)
     assert process.communicate('\n', timeout=20)[0] == 'done\n'
     assert process.returncode == 0
-
-
-# Extras
-
-
-def test_missing_packages_are_named_with_the_remedy(monkeypatch):
-    monkeypatch.setitem(sys.modules, 'pyarrow', None)
-    with pytest.raises(UsageError, match=r"pyarrow missing: pip install 'fetch_hand_sim\[data\]'"):
-        require_extra('data')
-    monkeypatch.setitem(sys.modules, 'rclpy', None)
-    with pytest.raises(UsageError, match=r'source a ROS 2 Jazzy installation or pip install'):
-        require_extra('ros')
 
 
 # Progress

@@ -1,7 +1,8 @@
-"""The reset option `start`, and values of `start` and `variation` that are rejected."""
+"""The reset option `start`, and arguments of `reset` that are rejected."""
 
 from __future__ import annotations
 
+import gymnasium
 import numpy as np
 import pytest
 
@@ -121,7 +122,7 @@ NAMES = 'allowed: joints, joint_velocities, object_pose, object_velocity'
     ],
 )
 def test_an_impossible_start_is_refused_in_one_line_and_nothing_moves(task, start, line):
-    assert_rejected(fetch_hand_sim.make_vec(task, 2), {'start': start}, line)
+    assert_rejected(fetch_hand_sim.make_vec(task, 2), line, options={'start': start})
 
 
 @pytest.mark.parametrize(
@@ -137,13 +138,50 @@ def test_an_impossible_start_is_refused_in_one_line_and_nothing_moves(task, star
 )
 def test_an_impossible_variation_is_rejected_likewise(disturbances, variation, line):
     env = fetch_hand_sim.make_vec('FetchPush', 2, disturbances=disturbances)
-    assert_rejected(env, {'variation': variation}, line)
+    assert_rejected(env, line, options={'variation': variation})
 
 
-def assert_rejected(env, options, line) -> None:
-    before, _ = env.reset(seed=0)
-    with pytest.raises(ValueError, match=line) as caught:
-        env.reset(seed=1, options=options)
+def goal(value):
+    return {'options': {'goal': value}}
+
+
+def mask(value):
+    return {'options': {'reset_mask': value}}
+
+
+@pytest.mark.parametrize(
+    ('numbers', 'arguments', 'line'),
+    [
+        ((1, 2), {'options': 3}, "options: '3' given; allowed: a mapping of goal, "),
+        ((1, 2), {'options': {'begin': 0}}, "options has no 'begin'; allowed: goal"),
+        ((1, 2), goal([0] * 6), r'goal of .*: shape \(6,\) given; .* \(7,\)'),
+        ((1, 2), goal([*[0] * 6, np.nan]), r'goal of .*\[6\] is nan'),
+        ((1, 2), goal([1, [2], 3]), 'goal: 3 values; allowed: one, or [12]$'),
+        ((1, 2), goal(np.zeros(7)), 'a goal quaternion must not be zero'),
+        ((1,), {'seed': -1}, 'greater or equal to zero'),
+        ((2,), {'seed': True}, 'seed True; allowed'),
+        ((2,), {'seed': [1, 2, 3]}, '2 environments take as many seeds, not 3'),
+        ((2,), mask([True, False]), 'array of 2 boo'),
+        ((2,), mask(np.ones(3, dtype=bool)), 'reset_mask .*True, *True, *True.*; allowed: an'),
+        ((2,), mask(np.zeros(2, dtype=bool)), 'reset_mask .*False, False.*; .* one of them Tr'),
+    ],
+)
+def test_other_arguments_are_rejected_likewise(numbers, arguments, line):
+    for number in numbers:
+        task = 'HandManipulateBlockFull'
+        env = fetch_hand_sim.make_vec(task, number) if number > 1 else fetch_hand_sim.make(task)
+        assert_rejected(env, line, **arguments)
+
+
+def state_of(env) -> bytes:
+    simulation = env.unwrapped.simulation
+    return simulation.task.batch.state.tobytes() + simulation.goals.tobytes()
+
+
+def assert_rejected(env, line, **arguments) -> None:
+    env.reset(seed=0)
+    before = state_of(env)
+    with pytest.raises((ValueError, gymnasium.error.Error), match=line) as caught:
+        env.reset(**{'seed': 1} | arguments)
     assert '\n' not in str(caught.value)
-    after = env.unwrapped.simulation.observe()
-    assert all((after[name] == before[name]).all() for name in before)
+    assert state_of(env) == before
