@@ -14,13 +14,8 @@ from fetch_hand_sim.simulation import Simulation
 from fetch_hand_sim.simulation.models import FETCH_NEVER_TOUCHING, load_model
 from fetch_hand_sim.simulation.tasks.registry import task_asset
 from msgs_spec.robots import FETCH
-from support.tasks import FAMILIES
+from support.tasks import each_task
 
-# One of each model.
-TASKS = (
-    *('FetchReach', 'FetchPush', 'FetchSlide', 'FetchPickAndPlace', 'HandReach'),
-    *('HandManipulateBlockFull', 'HandManipulateEggFull', 'HandManipulatePenFull'),
-)
 # Joints that hold the Fetch base, with damping 1e11: they do not move.
 FIXED = ('robot0:slide0', 'robot0:slide1', 'robot0:slide2')
 CLEARANCE = 0.01
@@ -43,10 +38,7 @@ def contacts(model: mujoco.MjModel, state: np.ndarray) -> list[bytes]:
     return [getattr(data.contact, name).tobytes() for name in names]
 
 
-@pytest.mark.parametrize(
-    'task',
-    [pytest.param(task, marks=[] if task in FAMILIES else [pytest.mark.release]) for task in TASKS],
-)
+@each_task
 def test_contacts_and_trajectories_are_those_of_the_published_model(task):
     simulation = Simulation(task, num_envs=48, num_threads=2)
     simulation.reset(seed=0)
