@@ -201,17 +201,6 @@ def test_a_policy_of_another_rate_is_refused(episode):
         Responder(load_policy('FetchReach'), status, Wire())
 
 
-@pytest.mark.parametrize('answer', [None, [[0.0] * 4], ['left'], [0.0, math.nan, 0.0, 0.0]])
-def test_an_invalid_action_is_one_line(answer):
-    class Strange:
-        def predict(self, observation, *, deterministic=True):
-            return answer, None
-
-    strange = LoadedPolicy(Strange(), 'FetchReach', 'actor strange.onnx')
-    with pytest.raises(ValueError, match=r'actor strange.onnx '):
-        strange.predict({'observation': np.zeros(10)})
-
-
 def test_a_policy_that_fails_once_answers_the_next_tick(case, episode):
     class Moody:
         calls = 0

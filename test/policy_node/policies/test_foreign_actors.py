@@ -68,21 +68,6 @@ def test_an_exported_actor_answers_as_its_checkpoint(tmp_path, monkeypatch):
         assert_refused(apart, 'keeps weights in other files')
 
 
-@pytest.mark.release
-@pytest.mark.parametrize(
-    ('task', 'features'),
-    [('HandManipulateBlockFull', 'symmetric'), ('HandManipulatePenFull', 'relative')],
-)
-def test_actors_that_see_how_far_the_goal_is_are_exported(task, features, tmp_path):
-    source, target = tmp_path / 'a.safetensors', tmp_path / 'a.onnx'
-    fresh_actor(source, task, goal_features=features, layer_norm=True)
-    assert export_actor([str(source), str(target)]) == 0
-    observation = observations(task_spec(task), 10)
-    action, _ = load_policy(target, task).policy.predict(observation)
-    wanted, _ = load_policy(source, task).policy.predict(observation)
-    np.testing.assert_allclose(action, wanted, atol=1e-5)
-
-
 def crafted_onnx(path, nodes, numbers):
     """An ONNX file with the inputs, the output and the metadata of an actor of FetchReach."""
     fresh_actor(path.with_suffix('.safetensors'), 'FetchReach')
@@ -227,7 +212,6 @@ def test_a_model_acts_with_the_statistics_beside_it(tmp_path, caplog):
 
 
 def test_a_model_whose_actions_were_rescaled_is_refused(tmp_path):
-    """By how much is not in its file."""
     library = pytest.importorskip('stable_baselines3')
     env = gymnasium.make('fetch_hand_sim/FetchReach-v0')
     half = gymnasium.wrappers.RescaleAction(env, np.float32(-0.5), np.float32(0.5))

@@ -1,7 +1,10 @@
-"""Damaged and crafted policy files: one-line errors, memory below 100 MB."""
+"""Policy files that are damaged, crafted or written by two processes at the same time."""
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -9,7 +12,7 @@ import numpy as np
 import pytest
 
 from policy_node.policies.checkpoint import parse_metadata
-from policy_node.policies.files import parse_tensors, tensor_bytes
+from policy_node.policies.files import parse_tensors, tensor_bytes, write_files
 from policy_node.policies.loading import load_policy
 from support import peak_memory, reset_peak_memory
 from support.fresh_actor import fresh_actor
@@ -44,7 +47,6 @@ def damaged(data: bytes, generator: np.random.Generator) -> bytes:
 
 
 def crafted(data: bytes, generator: np.random.Generator) -> bytes:
-    """Return a complete file with other metadata."""
     tensors, metadata = parse_tensors(data, 'a.safetensors')
     names = [name for name in metadata if name not in ('format', 'format_version')]
     for _ in range(generator.integers(1, 3)):
@@ -110,3 +112,26 @@ def test_actor_files_of_every_format_have_little_metadata(actor) -> None:
     large = '{"a": [' + '{},' * 400_000 + '{}]}'
     with pytest.raises(ValueError, match='1048576 characters'):
         parse_metadata({**metadata, 'config': large}, 'a.onnx')
+
+
+_WRITER = """
+import sys
+from pathlib import Path
+from policy_node.policies.files import write_files
+file, letter = Path(sys.argv[1]), sys.argv[2].encode()
+for _ in range(25):
+    write_files({file: letter * 100_000})
+"""
+
+
+def test_a_file_that_two_processes_write_at_once_is_always_whole(tmp_path: Path) -> None:
+    file = tmp_path / 'benchmark.csv'
+    write_files({file: b'a' * 100_000})
+    writers = [
+        subprocess.Popen([sys.executable, '-c', _WRITER, str(file), letter]) for letter in 'ab'
+    ]
+    while any(writer.poll() is None for writer in writers):
+        data = file.read_bytes()
+        assert data in (b'a' * 100_000, b'b' * 100_000), 'a reader sees one or the other'
+    assert [writer.returncode for writer in writers] == [0, 0]
+    assert os.listdir(tmp_path) == [file.name]

@@ -40,8 +40,9 @@ def test_shipped_actors_answer_as_torch_does(name: str) -> None:
 @pytest.mark.parametrize('task', ['FetchSlide', 'HandReach', 'HandManipulateBlockFull'])
 @pytest.mark.parametrize('features', ['plain', 'relative', 'symmetric'])
 @pytest.mark.parametrize('layer_norm', [False, True])
+@pytest.mark.parametrize('kind', ['native', pytest.param('onnx', marks=pytest.mark.release)])
 def test_every_kind_of_actor_answers_as_torch_does(
-    task: str, features: str, layer_norm: bool, tmp_path: Path
+    task: str, features: str, layer_norm: bool, kind: str, tmp_path: Path
 ) -> None:
     if features == 'symmetric' and not task.startswith('HandManipulate'):
         with pytest.raises(ValueError, match='no object pose'):
@@ -49,6 +50,9 @@ def test_every_kind_of_actor_answers_as_torch_does(
         return
     path = tmp_path / 'a.safetensors'
     actor = fresh_actor(path, task, goal_features=features, layer_norm=layer_norm)
+    if kind == 'onnx':
+        source, path = path, tmp_path / 'a.onnx'
+        pytest.importorskip('policy_node.policies.export_actor').export(source, path)
     observation = observations(task_spec(task), 50)
     action, _ = load_policy(path).policy.predict(observation)
     np.testing.assert_allclose(action, actor.predict(observation)[0], atol=1e-5)
