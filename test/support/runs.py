@@ -5,12 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from policy_node.policies.files import read_tensors
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.flat import value_text
 from policy_node.training.configuration.recipes import recipe_config
+from policy_node.training.evaluation import EpisodeOutcomes
 from policy_node.training.machine import Workers
 from policy_node.training.runs.trainer import Trainer
 
@@ -67,6 +69,12 @@ def weights(file: Path) -> dict[str, torch.Tensor]:
 def same(first: dict[str, torch.Tensor], second: dict[str, torch.Tensor]) -> bool:
     """Return whether both have the same tensors."""
     return first.keys() == second.keys() and all(torch.equal(first[n], second[n]) for n in first)
+
+
+def outcomes_of(success: Any, **others: Any) -> EpisodeOutcomes:
+    """Outcomes of as many episodes; besides `success` and `others`, all values are 0."""
+    zeros = {name: np.zeros(len(success)) for name in EpisodeOutcomes.__slots__}
+    return EpisodeOutcomes(**zeros | {'success_gymnasium': np.array(success)} | others)
 
 
 def one_line(capsys: Any) -> str:

@@ -27,6 +27,7 @@ from policy_node.training.machine import split_threads
 from policy_node.training.studies.research import STUDIES
 from policy_node.training.train_her import config_from_arguments, parse_arguments
 from support import ROOT
+from support.runs import one_line
 
 PEN = {'task': 'HandManipulatePenRotate', 'ticks_after_drop': 3}
 PPO = {'algorithm': 'ppo', 'overlap': False}
@@ -81,7 +82,6 @@ def test_what_a_study_switches_is_on_the_page_with_a_request():
 
 
 def test_scalars_of_numpy_are_values_of_python():
-    """For example values of `np.linspace`, or values read from a file."""
     given = {
         'gamma': np.float64(0.9),
         'total_steps': np.int64(400),
@@ -117,13 +117,11 @@ def test_bad_assignments_are_refused(text, match):
         ({'task': 'FetchFly'}, "unknown task 'FetchFly'"),
         ({'strategy': 'past'}, "strategy 'past'; allowed: final, future"),
         ({'gamma': 1.0}, 'gamma 1.0; allowed: 0 ... 0.999999'),
-        ({'batch_size': 0}, 'batch_size 0; allowed: 1'),
         ({'noise_std': float('inf')}, 'noise_std inf is no finite number'),
         ({'hidden_sizes': (0,)}, 'allowed: 1 to 64 widths'),
         ({'goals': 'past=.4'}, "'past'; allowed: "),
         ({'goals': 'future=.4,future=.4'}, 'is not name=share with commas'),
         ({'goals': 'future=.8,actual=.3'}, 'add up to at most 1'),
-        ({'goals': 'future=nan'}, 'add up to at most 1'),
         ({'goals': 'future=.5', 'strategy': 'none'}, 'excludes strategy none'),
         ({'ticks_after_drop': 3}, 'FetchPush has no palm to drop an object from'),
         ({'first_rotation': 2.0}, 'goals of FetchPush have no rotation'),
@@ -138,10 +136,7 @@ def test_bad_assignments_are_refused(text, match):
         ({'recipe': 'robust', 'past_actions': 99}, 'past_actions 99; allowed: 0'),
         ({'recipe': 'robust', 'disturbance_scales': (1, -1)}, 'one or more factors 0 ... 10'),
         ({'trace': 0.5}, 'trace 0.5 has no effect'),
-        (
-            {'importance': 'density', 'goals': 'future=1'},
-            'density needs goals of the episode .* beside others',
-        ),
+        ({'importance': 'density', 'goals': 'future=1'}, 'goals of the episode .* beside others'),
         ({'correction': 'cut'}, "correction 'cut' has no effect: it needs n_step other than 1"),
         ({'quantiles': 5, 'norm': 'batch', 'target': 'none'}, 'exclude .* norm batch'),
         ({'quantiles': 5, 'init_from': 'FetchReach'}, 'init_from excludes quantiles 5'),
@@ -155,17 +150,11 @@ def test_bad_assignments_are_refused(text, match):
         ({'noise_seconds': 0.01}, 'noise_seconds 0.01 is less than a tick of 0.04 s'),
         ({'longest_hold': 5, 'noise_seconds': 0.04}, 'longest_hold .* excludes noise_seconds'),
         ({'past_actions': 3, 'longest_hold': 5}, 'past_actions needs longest_hold=1'),
-        (
-            {'advantage': True, 'discount': 'time', 'critics': 2},
-            'advantage True has no effect: .* one critic',
-        ),
+        ({'advantage': True, 'discount': 'time', 'critics': 2}, 'advantage True .* one critic'),
         ({'subgoal_every': 51}, 'subgoal_every 51 is longer than an episode'),
         ({'subgoal_every': 9, 'n_step': 3}, 'n_step 3 has no effect: it needs .* no subgoal_every'),
         ({'subgoal_every': 9, 'importance': 'density'}, 'density. has no effect: it needs algo'),
-        (
-            {'subgoal_prior': 0.1, 'longest_hold': 5},
-            'subgoal_prior 0.1 has no effect: .* without .* longest_hold',
-        ),
+        ({'subgoal_prior': 0.1, 'longest_hold': 5}, 'subgoal_prior 0.1 .* longest_hold'),
         ({'imagination_interval': 4}, 'has no effect: it needs subgoal_prior other than 0.0'),
         ({**PPO, 'overlap': True}, 'algorithm ppo needs overlap=false'),
         ({**PPO, 'random_epsilon': 0.2}, 'random_epsilon 0.2 has no effect'),
@@ -176,6 +165,7 @@ def test_bad_assignments_are_refused(text, match):
         ({'first_value': -50.0}, 'has no effect: it needs algorithm ppo'),
         ({'total_steps': 10**400}, 'total_steps is too large; allowed: up to 9007'),
         ({'gamma': 10**400}, 'gamma 1.* is not of type float'),
+        ({'recipe': 'good'}, "recipe 'good'; allowed: paper, best, robust, finetune"),
         ({'control_hz': 60.0}, 'control_hz'),
     ],
 )
@@ -204,9 +194,7 @@ def test_idle_parts_of_learning_are_named_in_a_line(changes, idle):
     assert all(word in line for word, line in zip(idle, lines, strict=True))
 
 
-def test_an_unknown_recipe_or_stored_field_is_refused():
-    with pytest.raises(ValueError, match="recipe 'good'; allowed: paper, best, robust, finetune"):
-        recipe_config('FetchPush', 'good')
+def test_an_unknown_stored_field_is_refused():
     stored = to_flat(recipe_config('FetchPush', 'best'))
     with pytest.raises(ValueError, match='unknown configuration fields: colour'):
         config_from_dict({**stored, 'colour': 1})
@@ -285,6 +273,4 @@ def test_options_become_fields_of_their_types_and_nothing_else_is_set():
 def test_a_typing_error_is_one_line(arguments, message, capsys):
     with pytest.raises(SystemExit) as ended:
         options_of(*arguments)
-    error = capsys.readouterr().err
-    assert ended.value.code == 2
-    assert message in error and error.count('\n') == 1
+    assert ended.value.code == 2 and message in one_line(capsys)

@@ -26,13 +26,23 @@ from support.runs import SMALL, STATE, one_line, options_of, resumed
 REPLAY, BEST = 'replay.safetensors', 'best.safetensors'
 
 
-def change_state(run, change=lambda tensors: None, counters=None, **extra):
+def change_state(run, part=None, change=None, counters=None, **extra):
+    """Change a tensor, or remove it or a part of the state; change counters and other metadata."""
     tensors, metadata = read_tensors(run / STATE)
-    tensors = dict(tensors)
-    change(tensors)
+    chosen = [name for name in tensors if name == part or name.startswith(f'{part}.')]
+    changed = {name: change(tensors[name]) for name in chosen if change}
+    kept = {name: values for name, values in tensors.items() if name not in chosen}
     metadata['counters'] = json.dumps(json.loads(metadata['counters']) | (counters or {}))
     metadata['extra'] = json.dumps(json.loads(metadata['extra']) | extra)
-    write_tensors(run / STATE, tensors, metadata)
+    write_tensors(run / STATE, kept | changed, metadata)
+
+
+def nan(values):
+    return np.full_like(values, np.nan)
+
+
+def shorter(values):
+    return values[:1]
 
 
 def refusal(run, capsys, *more):
@@ -63,42 +73,20 @@ def test_an_invalid_origin_is_rejected(run, capsys):
     assert 'init_from is not an object' in refusal(run, capsys)
 
 
-def nan_in(name):
-    def change(tensors):
-        tensors[name] = np.full_like(tensors[name], np.nan)
-
-    return change
-
-
-def shorter(name):
-    def change(tensors):
-        tensors[name] = tensors[name][:1]
-
-    return change
-
-
-def without(prefix):
-    def change(tensors):
-        for name in [name for name in tensors if name.startswith(prefix)]:
-            del tensors[name]
-
-    return change
-
-
 @pytest.mark.parametrize(
-    ('change', 'message'),
+    ('part', 'change', 'message'),
     [
-        (nan_in('actor.network.output.bias'), 'actor.network.output.bias'),
+        ('actor.network.output.bias', nan, 'actor.network.output.bias'),
         # Adam's fused step would write beyond the end of these.
-        (shorter('critic_optimizer.0.exp_avg'), 'exp_avg of parameter 0 is (1, 17) torch.float32'),
-        (without('critic_optimizer.1.step'), 'parameter 1 has'),
-        (without('critic_optimizer.'), 'critic_optimizer is missing'),
-        (without('goal_statistics.count'), 'Missing key(s) in state_dict: "count"'),
-        (shorter('actor.network.output.bias'), 'Actor: size mismatch for network.output.bias'),
+        ('critic_optimizer.0.exp_avg', shorter, 'exp_avg of parameter 0 is (1, 17) torch.float32'),
+        ('critic_optimizer.1.step', None, 'parameter 1 has'),
+        ('critic_optimizer', None, 'critic_optimizer is missing'),
+        ('goal_statistics.count', None, 'Missing key(s) in state_dict: "count"'),
+        ('actor.network.output.bias', shorter, 'Actor: size mismatch for network.output.bias'),
     ],
 )
-def test_invalid_tensors_are_rejected(run, change, message):
-    change_state(run, change)
+def test_invalid_tensors_are_rejected(run, part, change, message):
+    change_state(run, part, change)
     with pytest.raises(ValueError, match=re.escape(message)):
         resumed(run)
 
@@ -109,7 +97,7 @@ def test_an_actor_is_no_training_state(run, capsys):
 
 
 def test_no_run_starts_from_networks_that_are_not_finite(run):
-    change_state(run, nan_in('critic.network.output.bias'))
+    change_state(run, 'critic.network.output.bias', nan)
     with pytest.raises(ValueError, match=r'critic\.network\.output\.bias'):
         read_initial_networks(str(run))
 
@@ -117,10 +105,10 @@ def test_no_run_starts_from_networks_that_are_not_finite(run):
 @pytest.mark.parametrize(
     ('name', 'change', 'message'),
     [
-        ('observation', lambda a: np.full_like(a, np.nan), 'observation has a value that is not'),
+        ('observation', nan, 'observation has a value that is not'),
         ('observation', lambda a: a.astype(np.int32), 'observation is int32, not float32'),
         # NumPy would give the one goal to every episode.
-        ('desired_goal', lambda a: a[:1], 'desired_goal is (1, 3), action (24, 50, 4)'),
+        ('desired_goal', shorter, 'desired_goal is (1, 3), action (24, 50, 4)'),
         ('action', lambda a: np.zeros((), np.float32).reshape(1)[0:1], 'observation is (24, 51'),
     ],
 )

@@ -23,7 +23,7 @@ from policy_node.training.evaluation import (
     wilson_interval,
 )
 from support.fresh_actor import fresh_actor
-from support.runs import one_line
+from support.runs import one_line, outcomes_of
 
 
 class TowardsGoal:
@@ -49,22 +49,15 @@ def test_wilson_interval(successes, episodes, interval):
     assert wilson_interval(successes, episodes) == pytest.approx(interval, abs=5e-5)
 
 
-def test_a_good_policy_succeeds_and_a_resting_one_does_not():
-    good = evaluate(simulation(10), TowardsGoal(), 20, first_seed=0)
-    assert good.success_gymnasium.all() and good.success_paper.all() and good.touched.all()
-    assert (good.episode_return > -15).all() and (good.episode_return < 0).any()
-    rest = evaluate(simulation(10), RestingPolicy(4), 20, first_seed=0)
-    assert rest.success_gymnasium.mean() < 0.3
-    assert rest.episode_return.mean() < -35
-
-
-def test_an_episode_depends_on_its_seed_alone():
+def test_an_episode_depends_on_its_seed_alone_and_a_good_policy_succeeds():
     one = evaluate(simulation(1), TowardsGoal(), 6, first_seed=40)
     many = evaluate(simulation(4), TowardsGoal(), 6, first_seed=40)
     assert len(one) == len(many) == 6
     for name in EpisodeOutcomes.__slots__:
         np.testing.assert_array_equal(getattr(one, name), getattr(many, name))
     assert one.seed.tolist() == list(range(40, 46))
+    assert one.success_gymnasium.all() and one.success_paper.all() and one.touched.all()
+    assert (one.episode_return > -15).all() and (one.episode_return < 0).any()
     other = evaluate(simulation(4), TowardsGoal(), 6, first_seed=50)
     assert (other.episode_return != one.episode_return).any()
 
@@ -96,9 +89,9 @@ def test_both_rules_are_applied():
 
 def test_summary():
     flags = np.array([True, False, True, False])
-    outcomes = EpisodeOutcomes(
+    outcomes = outcomes_of(
+        flags,
         seed=np.arange(4) + 7,
-        success_gymnasium=flags,
         success_paper=~flags,
         touched=flags | True,
         episode_return=np.arange(4) * -1.0,
@@ -156,27 +149,6 @@ def test_fallen_objects_and_goals_the_long_way_round_are_counted():
     assert np.isnan(dropped.final_distance).all() and (dropped.final_rotation >= 0).all()
 
 
-def test_command_line_writes_table_json_and_csv(tmp_path, capsys):
-    json_file, csv_file = tmp_path / 'a' / 'e.json', tmp_path / 'e.csv'
-    arguments = ['--policy', 'FetchReach', '--episodes', '20', '--threads', '1', '--num-envs', '8']
-    assert main([*arguments, '--json', str(json_file), '--csv', str(csv_file)]) == 0
-    report = json.loads(json_file.read_text())
-    assert report['task'] == 'FetchReach' and report['episodes'] == 20
-    assert report['success_gymnasium'] == 1.0
-    assert len(report['sha256']) == 64
-    rows = list(csv.DictReader(csv_file.open()))
-    assert len(rows) == 20 and {row['success_gymnasium'] for row in rows} == {'1'}
-    returns = [float(row['episode_return']) for row in rows]
-    assert report['mean_return'] == pytest.approx(np.mean(returns))
-    assert 'gymnasium rule' in capsys.readouterr().out
-
-
-def outcomes_of(success):
-    """Outcomes of as many episodes; only the success by the released code's rule varies."""
-    zeros = {name: np.zeros(len(success)) for name in EpisodeOutcomes.__slots__}
-    return EpisodeOutcomes(**zeros | {'success_gymnasium': np.array(success)})
-
-
 @pytest.mark.parametrize(('episodes', 'good', 'bad'), [(50, 0.95, 0.8), (400, 0.3, 0.28)])
 def test_the_interval_of_a_difference_holds_it_in_95_of_100_cases(episodes, good, bad):
     """Half of the episodes are equally difficult for both policies, so successes correlate."""
@@ -191,19 +163,27 @@ def test_the_interval_of_a_difference_holds_it_in_95_of_100_cases(episodes, good
     assert 0.93 <= np.mean(found) <= 0.99
 
 
-def test_two_policies_are_compared_on_the_same_episodes(tmp_path, capsys):
-    json_file = tmp_path / 'e.json'
+def test_the_command_writes_table_json_and_csv_and_compares_two_policies(tmp_path, capsys):
+    json_file, csv_file = tmp_path / 'a' / 'e.json', tmp_path / 'e.csv'
     arguments = ['--policy', 'FetchReach', '--against', 'resting', '--episodes', '16']
-    assert main([*arguments, '--threads', '1', '--json', str(json_file)]) == 0
-    report = json.loads(json_file.read_text())
+    arguments += ['--threads', '1', '--json', str(json_file), '--csv', str(csv_file)]
+    assert main(arguments) == 0
+    report, rows = json.loads(json_file.read_text()), list(csv.DictReader(csv_file.open()))
+    about = report['task'], report['episodes'], report['success_gymnasium'], len(report['sha256'])
+    assert about == ('FetchReach', 16, 1.0, 64)
+    assert len(rows) == 16 and {row['success_gymnasium'] for row in rows} == {'1'}
+    returns = [float(row['episode_return']) for row in rows]
+    assert report['mean_return'] == pytest.approx(np.mean(returns))
     other = report['against']
     resting = evaluate(simulation(16), RestingPolicy(4), 16, report['first_seed'])
-    assert other['success_gymnasium'] == resting.success_gymnasium.mean()
+    assert other['success_gymnasium'] == resting.success_gymnasium.mean() < 0.3
+    assert resting.episode_return.mean() < -35
     assert other['only_first'] == 16 - resting.success_gymnasium.sum()
     assert (other['policy'], other['episodes'], other['only_second']) == ('resting', 16, 0)
     low, high = other['difference_interval_95']
     assert 0.5 < low < other['difference'] == other['only_first'] / 16 <= high <= 1.0
-    assert 'success minus that of resting' in capsys.readouterr().out
+    output = capsys.readouterr().out
+    assert 'gymnasium rule' in output and 'success minus that of resting' in output
 
 
 def test_the_first_policy_is_reported_although_the_second_fails(tmp_path, monkeypatch, capsys):

@@ -1,4 +1,4 @@
-"""Methods for high action frequencies, on problems with a known solution."""
+"""Collection of episodes, and methods for high action frequencies."""
 
 from __future__ import annotations
 
@@ -11,9 +11,11 @@ from fetch_hand_sim.simulation.rewards import GoalMetric
 from msgs_spec.tasks import task_spec
 from policy_node.policies.actor import Actor
 from policy_node.policies.network_shape import NetworkShape
+from policy_node.policies.policy import RestingPolicy
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.flat import from_flat, to_flat
 from policy_node.training.configuration.recipes import recipe_config
+from policy_node.training.experience.collector import Collector
 from policy_node.training.experience.replay import Episodes, Transitions
 from policy_node.training.learners.ddpg import DDPG
 from policy_node.training.machine import Workers
@@ -80,10 +82,15 @@ def test_values_discount_ticks_or_time(
     assert (sampler.reward_scale, sampler.gamma) == pytest.approx((share, gamma))
 
 
+def actor_of(outputs: int, *hidden: int) -> Actor:
+    torch.manual_seed(0)
+    return Actor(NetworkShape(10, 3, outputs, hidden or (16,))).eval()
+
+
 def collected(**options: object) -> Episodes:
     """An episode in each of eight simulations at 250 Hz, around an actor that rests."""
     simulation = Simulation('FetchReach', num_envs=8, num_threads=1, control_hz=250.0)
-    actor = Actor(NetworkShape(10, 3, 4, (8,))).eval()
+    actor = actor_of(4)
     torch.nn.init.zeros_(actor.network.output.weight)
     config = config_at(250.0, noise_std=0.2, random_epsilon=0.0, **options)
     return make_collector(simulation, list(range(8)), config).collect(actor)[0]
@@ -102,8 +109,7 @@ def test_noise_that_holds_for_40_ms_moves_the_gripper_as_at_25_hz() -> None:
 
 
 def test_noise_on_weights_moves_actions_as_far_as_asked():
-    torch.manual_seed(0)
-    actor = Actor(NetworkShape(10, 3, 4, (64, 64))).eval()
+    actor = actor_of(4, 64, 64)
     config = config_at(25.0, parameter_noise=True, noise_std=0.2, random_epsilon=0.0)
     simulation = Simulation('FetchReach', num_envs=8, num_threads=1)
     collector = make_collector(simulation, list(range(8)), config)
@@ -121,28 +127,20 @@ def test_lengths_mean_ticks_and_ticks_lengths() -> None:
 
 
 @pytest.mark.parametrize('noise', [0.0, 0.3])
-def test_what_is_recorded_of_held_actions_is_what_was_executed(noise: float) -> None:
+def test_held_actions_are_recorded_with_the_ticks_left(noise: float) -> None:
     """Two episodes in each of two simulations; without noise every decision is the actor's."""
-    torch.manual_seed(0)
-    actor = Actor(NetworkShape(10, 3, 5, (16,))).eval()
+    actor = actor_of(5)
     with torch.no_grad():
         # Lengths that differ from state to state.
         actor.network.output.weight.mul_(4.0)
     config = from_flat(
         {'task': 'FetchReach'}, longest_hold=6, noise_std=noise, random_epsilon=noise
     )
-    simulation, again = (Simulation('FetchReach', num_envs=2, num_threads=1) for _ in range(2))
+    simulation = Simulation('FetchReach', num_envs=2, num_threads=1)
     collector = make_collector(simulation, [3, 4], config)
     lengths: set[int] = set()
-    for seeds in ([3, 4], None):
+    for _ in range(2):
         episodes, _ = collector.collect(actor)
-        observation = again.reset(seed=seeds)
-        for tick in range(50):
-            seen = observation['observation'].astype(np.float32)
-            np.testing.assert_array_equal(episodes.observation[:, tick], seen)
-            observation = again.step(episodes.action[:, tick, :4]).observation
-        last = observation['observation'].astype(np.float32)
-        np.testing.assert_array_equal(episodes.observation[:, 50], last)
         for row in range(2):
             decided = decisions(episodes.action[row], 6)
             lengths |= set(np.diff([*decided, 50]))
@@ -215,3 +213,44 @@ def test_the_best_recipe_counts_time_as_time_at_high_rates() -> None:
     assert values('best', 'n_step', *counts, control_hz=12.5) == [1, *(n // 2 for n in usual)]
     paper = values('paper', 'n_step', *counts, control_hz=250.0)
     assert paper == values('paper', 'n_step', *counts)
+
+
+def plain_collector(noise_std=0.2, random_epsilon=0.3, envs=4):
+    simulation = Simulation('FetchReach', num_envs=envs, num_threads=1)
+    config = from_flat({'task': 'FetchReach'}, noise_std=noise_std, random_epsilon=random_epsilon)
+    return Collector(simulation, [10 * i for i in range(envs)], config)
+
+
+def test_episodes_are_what_the_simulation_does_with_the_actions():
+    collector = plain_collector()
+    episodes, success = collector.collect(actor_of(4))
+    assert (len(episodes), episodes.ticks) == (4, 50)
+    simulation = Simulation('FetchReach', num_envs=4, num_threads=1)
+    observation = simulation.reset(seed=[0, 10, 20, 30])
+    reached = np.zeros(4, bool)
+    for tick in range(50):
+        expected = observation['observation'].astype(np.float32)
+        np.testing.assert_array_equal(episodes.observation[:, tick], expected)
+        result = simulation.step(episodes.action[:, tick])
+        observation, reached = result.observation, result.success
+    np.testing.assert_array_equal(
+        episodes.achieved_goal[:, 50], observation['achieved_goal'].astype(np.float32)
+    )
+    np.testing.assert_array_equal(
+        episodes.desired_goal, observation['desired_goal'].astype(np.float32)
+    )
+    assert success == reached.mean()
+    following, _ = collector.collect(actor_of(4))
+    assert (following.desired_goal != episodes.desired_goal).all(), 'later cycles have new goals'
+
+
+@pytest.mark.parametrize('epsilon', [0.0, 0.3])
+def test_noise_has_the_spread_and_the_share_asked_for(epsilon):
+    episodes, _ = plain_collector(0.1, epsilon, envs=20).collect(RestingPolicy(4))
+    actions = episodes.action.reshape(-1, 4)
+    assert np.abs(actions).max() <= 1.0
+    # Five standard deviations of the Gaussian; a uniform action stays inside with 0.5 ** 4.
+    outside = (np.abs(actions) > 0.5).any(axis=1).mean()
+    assert outside == pytest.approx(epsilon * (1 - 0.5**4), abs=0.04)
+    inside = actions[(np.abs(actions) <= 0.5).all(axis=1)]
+    assert inside.std() == pytest.approx(0.1, abs=0.012)

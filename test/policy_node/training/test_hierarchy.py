@@ -1,4 +1,4 @@
-"""A high level whose actions are goals, and subgoals while episodes are collected."""
+"""Subgoals: a high level whose actions are goals, and imagined ones as a prior on the actor."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ from fetch_hand_sim.simulation import Simulation
 from policy_node.policies.actor import Actor
 from policy_node.policies.network_shape import NetworkShape
 from policy_node.training.configuration.config import TrainConfig
-from policy_node.training.configuration.flat import from_flat
+from policy_node.training.configuration.flat import from_flat, to_flat
 from policy_node.training.configuration.recipes import recipe_config
 from policy_node.training.experience.replay import Episodes, Transitions
+from policy_node.training.learners.imagined import ImaginingDDPG
 from policy_node.training.machine import Workers
 from policy_node.training.research.hierarchy import (
     TESTED,
@@ -28,7 +29,6 @@ CPU = torch.device('cpu')
 
 
 def configured(**changes: object) -> TrainConfig:
-    """Updates that move fast, targets that follow at once."""
     quick = {'precision': 'float32', 'target_update_interval': 1, 'polyak': 0.9, 'action_l2': 0.0}
     return recipe_config('FetchReach', 'best', **{**quick, 'subgoal_every': 10, **changes})
 
@@ -61,8 +61,6 @@ def test_the_high_level_proposes_and_learns_goals_on_the_same_scale() -> None:
 
 
 class Constant:
-    """A policy whose every action is the same number."""
-
     def __init__(self, value, size):
         self.value, self.size = value, size
 
@@ -160,7 +158,8 @@ def test_what_was_achieved_was_proposed_unless_a_test_was_missed(subgoal, tested
     )
     row = np.zeros(300, np.int64)
     episodes = walk(subgoal, tested)
-    batch = sampler.sample(episodes, row, {'real': 1.0}, np.random.default_rng(0))
+    mixture = {'future': 0.5, 'real': 0.5}
+    batch = sampler.sample(episodes, row, mixture, np.random.default_rng(0))
     tick = batch.observation[:, 0].astype(int)
     assert set(tick) == {0, 1, 2, 3}
     penalty = (tick % 3 == 0) & missed
@@ -169,7 +168,12 @@ def test_what_was_achieved_was_proposed_unless_a_test_was_missed(subgoal, tested
     np.testing.assert_array_equal(batch.next_observation[:, 0], tick + 3)
     np.testing.assert_array_equal(batch.action[:, 0], np.where(penalty, subgoal, tick + 3))
     np.testing.assert_allclose(batch.discount, np.where(penalty, 0.0, 0.125))
-    summed = [-sum(0.5**i * (t + i + 1 != 5) for i in range(3)) for t in tick]
+    goals = batch.goal[:, 0]
+    assert set(goals) == {1.0, 2.0, 3.0, 4.0, 5.0, 6.0}
+    summed = [
+        -sum(0.5**i * (t + i + 1 != goal) for i in range(3))
+        for t, goal in zip(tick, goals, strict=True)
+    ]
     np.testing.assert_allclose(batch.reward, np.where(penalty, -2.0, summed))
 
 
@@ -180,3 +184,104 @@ def test_half_of_the_goals_that_are_kept_are_subgoals():
         'subgoal': 0.1,
     }
     assert with_subgoals({'future': 1.0}) == {'future': 1.0}
+
+
+SHAPE = NetworkShape(10, 3, 4, (64, 64))
+
+
+def imagining(**changes):
+    quick = {'precision': 'float32', 'action_l2': 0.0, 'goal_features': 'plain'}
+    return recipe_config('FetchReach', 'best', **{**quick, 'subgoal_prior': 1.0, **changes})
+
+
+class Distance(torch.nn.Module):
+    """The true value: minus the ticks to the goal, `per_unit` for each unit of distance."""
+
+    def __init__(self, per_unit):
+        super().__init__()
+        self.per_unit = per_unit
+        self.unused = torch.nn.Parameter(torch.zeros(()))
+
+    def forward(self, features, action):
+        distance = (features[:, :3] - features[:, -3:]).norm(dim=-1)
+        return -self.per_unit * distance + self.unused + 0.0 * action.sum(dim=-1)
+
+
+def learner_of(**changes):
+    """Return a learner whose critic has the true values."""
+    torch.manual_seed(0)
+    learner = ImaginingDDPG(SHAPE, imagining(**changes), torch.device('cpu'), Workers())
+    learner.critic = learner.target_critic = Distance(20.0)
+    learner.critic_parameters = [learner.critic.unused]
+    learner.critic_optimizer = torch.optim.Adam(learner.critic_parameters, lr=0.0)
+    return learner
+
+
+def on_a_line(generator, count):
+    """States and goals anywhere from -1 to 1 along the first axis."""
+    state, goal = np.zeros((count, 10), np.float32), np.zeros((count, 3), np.float32)
+    state[:, 0], goal[:, 0] = generator.uniform(-1, 1, (2, count))
+    nothing = np.zeros(count, np.float32)
+    return Transitions(state, state, goal, np.zeros((count, 4), np.float32), nothing, nothing)
+
+
+@pytest.mark.release
+def test_what_is_imagined_lies_halfway_by_value():
+    learner, generator = learner_of(learning_rate=3e-3), np.random.default_rng(0)
+    for _ in range(400):
+        learner.update(on_a_line(generator, 512))
+    batch = on_a_line(generator, 500)
+    inputs = torch.from_numpy(batch.observation), torch.from_numpy(batch.goal)
+    with torch.no_grad():
+        imagined = learner.imagine(learner.actor.features(*inputs)).numpy()
+    middle = (batch.observation[:, 0] + batch.goal[:, 0]) / 2
+    assert np.abs(imagined[:, 0] - middle).mean() < 0.1
+    assert np.abs(imagined[:, 1:]).max() < 0.1
+
+
+def test_the_actor_is_drawn_to_what_it_does_for_the_subgoal():
+    """Values here say nothing of actions, so the prior alone moves the actor."""
+    learner, generator = learner_of(subgoal_prior=5.0), np.random.default_rng(0)
+    batch = on_a_line(generator, 64)
+    known = learner.tensors(batch)
+
+    def distance():
+        with torch.no_grad():
+            subgoal = learner.imagine(known.features)
+            prior = learner.act(batch.observation, subgoal.numpy())
+            own = learner.act(batch.observation, batch.goal)
+            penalty = learner._penalty(known, learner.actor(known.features))
+        assert float(penalty) == pytest.approx(5.0 * np.square(own - prior).mean(), rel=1e-4)
+        return float(penalty)
+
+    # Until the copy moves for the first time it is the actor as it was.
+    before = distance()
+    learner.config = imagining(subgoal_prior=5.0, target_update_interval=1, polyak=0.0)
+    for _ in range(200):
+        learner.update(batch)
+    assert distance() < 0.1 * before
+
+
+def test_the_network_that_imagines_learns_at_its_interval():
+    changes = {'subgoal_prior': 0.3, 'imagination_interval': 3}
+    learner, batch = learner_of(**changes), on_a_line(np.random.default_rng(0), 64)
+    learnt = []
+    for _ in range(7):
+        before = [value.clone() for value in learner.imagination.parameters()]
+        learner.update(batch)
+        now = list(learner.imagination.parameters())
+        learnt.append(not all(torch.equal(*pair) for pair in zip(before, now, strict=True)))
+    assert learnt == [True, False, False, True, False, False, True]
+
+
+@pytest.mark.parametrize(
+    ('task', 'changes', 'prior'),
+    [
+        ('FetchPickAndPlace', {}, 0.3),
+        ('FetchPickAndPlace', {'subgoal_prior': 0.0}, 0.0),
+        ('FetchPickAndPlace', {'condition': 'threshold'}, 0.0),
+        ('FetchPush', {}, 0.0),
+    ],
+)
+def test_best_imagines_where_it_pays_and_nothing_else_is_asked_for(task, changes, prior):
+    assert to_flat(recipe_config(task, 'best', **changes))['subgoal_prior'] == prior

@@ -91,7 +91,6 @@ def test_displaced_goals_are_near_the_state_and_know_nothing_of_the_step(episode
 
 
 def test_no_displacement_is_taken_from_after_an_end(episodes):
-    """Such as that of an object which falls."""
     valid = np.array([1, 2, 3, 4, 5, TICKS])
     achieved = episodes.achieved_goal.copy()
     for row, last in enumerate(valid):
@@ -137,7 +136,6 @@ def test_goal_sources_can_be_mixed(text, mixture):
 
 @pytest.mark.parametrize('source', ['future', 'final', 'episode', 'random'])
 def test_nothing_is_drawn_from_after_the_last_valid_tick(episodes, source):
-    """Neither transitions nor goals."""
     valid = np.array([1, 2, 5, 7, TICKS, TICKS])
     generator = np.random.default_rng(2)
     row = generator.integers(COUNT, size=20_000)

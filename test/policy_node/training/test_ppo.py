@@ -251,6 +251,18 @@ def test_a_share_of_a_batch_is_from_episodes_that_moved_the_object(share: float)
     assert set(drawn) >= set(moved)
 
 
+def batch_of(inputs: np.ndarray, action: np.ndarray, *others: np.ndarray) -> RolloutTransitions:
+    """Transitions of inputs (state, goal); their value targets contain the rewards."""
+    state, goal, nothing = inputs[:, :1], inputs[:, 1:], np.zeros(len(action))
+    arrays = state, state, goal, action, nothing, nothing, *others
+    return RolloutTransitions(
+        **{
+            each.name: array.astype(np.float32)
+            for each, array in zip(fields(RolloutTransitions), arrays, strict=True)
+        }
+    )
+
+
 def test_the_first_losses_are_those_of_the_definition() -> None:
     """Two actions each, within the range and at its limits; weights, and ratios either way."""
     config = configured(action_l2=0.7, learning_rate=0.0)
@@ -273,22 +285,8 @@ def test_the_first_losses_are_those_of_the_definition() -> None:
     # Of noise beyond a limit, all that lies there counts.
     beyond = np.vectorize(math.erfc)((1.0 - np.sign(action) * mean) / (0.3 * math.sqrt(2))) / 2
     density = np.where(np.abs(action) == 1.0, beyond, inside).prod(axis=1)
-    arrays = {
-        'observation': inputs[:, :1],
-        'next_observation': inputs[:, :1],
-        'goal': inputs[:, 1:],
-        'action': action,
-        # The value target has both already.
-        'reward': np.zeros(6),
-        'discount': np.zeros(6),
-        'log_probability': np.log(density / ratio),
-        'advantage': advantage,
-        'value_target': target,
-        'weight': weight,
-    }
-    losses = learner.update(
-        RolloutTransitions(**{name: array.astype(np.float32) for name, array in arrays.items()})
-    )
+    logs = np.log(density / ratio)
+    losses = learner.update(batch_of(inputs, action, logs, advantage, target, weight))
     critic_loss = (weight * np.square(value - target)).mean()
     assert losses.critic.item() == pytest.approx(critic_loss, rel=1e-4)
     actor_loss = -(weight * gain).mean() + 0.7 * np.square(mean).mean()
@@ -303,20 +301,10 @@ def test_probabilities_that_float32_cannot_compare_ruin_no_network(
 ) -> None:
     """As of goals in hindsight beside little noise: exp(89) is beyond float32."""
     learner = make_ppo(configured(), 1, 1, 2, hidden=(4,))
-    pairs = {name: np.full((6, 1), 0.3, np.float32) for name in ('observation', 'goal')}
-    action, numbers = np.full((6, 2), 0.2, np.float32), np.zeros(6, np.float32)
-    logs = learner.log_probabilities(pairs['observation'], pairs['goal'], action)
-    batch = RolloutTransitions(
-        **pairs,
-        next_observation=pairs['observation'],
-        action=action,
-        reward=numbers,
-        discount=numbers,
-        log_probability=logs - np.float32(log_ratio),
-        advantage=numbers + np.float32(advantage),
-        value_target=numbers,
-        weight=numbers + 1,
-    )
+    inputs, action, one = np.full((6, 2), 0.3), np.full((6, 2), 0.2, np.float32), np.ones(6)
+    state = np.full((6, 1), 0.3, np.float32)
+    logs = learner.log_probabilities(state, state, action)
+    batch = batch_of(inputs, action, logs - log_ratio, advantage * one, 0.0 * one, one)
     for _ in range(3):
         losses = learner.update(batch)
         assert torch.isfinite(losses.actor)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -269,6 +270,8 @@ def test_time_is_compared_on_machines_of_the_baseline(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     report, study = tmp_path / 'report', STUDIES['returns']
+    # Of two lines about a run, the later one counts.
+    store(report, jobs_of('returns', '--arms', 'one', '--seeds', '0'), 'B')
     store(report, jobs_of('returns', '--arms', 'one'))
     store(report, jobs_of('returns', '--arms', 'none5', '--seeds', '0', '1'))
     store(report, jobs_of('returns', '--arms', 'none5', '--seeds', '2', '3', '4'), 'B', 1.0)
@@ -279,19 +282,11 @@ def test_time_is_compared_on_machines_of_the_baseline(
     assert (one['timed'], one['processor_seconds_median']) == (5, 12.0)
     assert (none5['seeds'], none5['timed'], none5['processor_seconds_median']) == (5, 2, 10.5)
     assert (none3['timed'], none3['area_in_time_median']) == (0, '')
+    write_study(study, report)
+    assert '| 5 | 0.500' in (report / 'README.md').read_text()
     lines = format_study(study, [one, none3, none5]).splitlines()
     assert lines[3].endswith('| 0.500 (0.500 ... 0.500) | - | - | - | fewer than five seeds |')
     assert lines[4].count(', of 2 | ') == 3 and lines[4].endswith('| no significant difference |')
-
-
-def test_of_two_lines_about_a_run_the_later_one_counts(tmp_path: Path) -> None:
-    (job,) = jobs_of('returns', '--arms', 'one', '--seeds', '0')
-    for machine in ('A', 'B'):
-        store(tmp_path, [job], machine)
-    (run,) = read_runs(tmp_path).values()
-    assert run['machine'] == 'B'
-    write_study(STUDIES['returns'], tmp_path)
-    assert '| 1 | 0.500' in (tmp_path / 'README.md').read_text()
 
 
 @pytest.mark.parametrize('line', ['{"task": "Fetch', '[]', '{"task": "FetchPush"}'])
@@ -303,8 +298,7 @@ def test_a_damaged_line_is_named_before_anything_is_trained(
     with (report / 'runs.jsonl').open('a') as file:
         file.write(line + '\n')
     assert main(['--study', 'returns', '--report', str(report), '--output', str(runs)]) == 2
-    error = capsys.readouterr().err
-    assert 'runs.jsonl, line 6, is no run' in error and error.count('\n') == 1
+    assert 'runs.jsonl, line 6, is no run' in one_line(capsys)
     assert not runs.exists()
 
 
@@ -329,3 +323,54 @@ def test_a_full_disk_leaves_stored_runs_and_page_as_they_were(
     with files_at_most(largest), pytest.raises(OSError, match='large'):
         write_study(STUDIES['returns'], tmp_path)
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+PAGE = ROOT / 'docs' / 'research' / 'studies.md'
+FEW = ['--seeds', '0', '--steps', '800', '--episodes', '2', '--set', 'num_envs=8']
+FEW += ['--set', 'evaluation_episodes=4', '--set', 'evaluate_every=400']
+
+
+@pytest.fixture
+def module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Its name; the working directory has it."""
+    (example,) = re.findall(r'```python\n(.*?)```', PAGE.read_text(), re.DOTALL)
+    name = f'studies_of_{tmp_path.name}'.replace('-', '_')
+    (tmp_path / f'{name}.py').write_text(
+        f'{example}\nFAILS = 3\n'
+        + example.replace('WIDTHS', 'TAKEN').replace("'widths'", "'values'")
+    )
+    monkeypatch.chdir(tmp_path)
+    return name
+
+
+@pytest.mark.release
+def test_the_study_of_the_page_runs(module: str, tmp_path: Path) -> None:
+    assert main(['--study', f'{module}:WIDTHS', *FEW]) == 0
+    report = tmp_path / 'docs' / 'research' / 'widths'
+    assert [run['arm'] for run in read_runs(report).values()] == ['w256', 'w64']
+    assert (report / 'figure.png').is_file()
+    assert (tmp_path / 'runs' / 'research' / 'widths' / 'FetchReach' / 'w64' / 'seed0').is_dir()
+
+
+def test_columns_of_the_tables_are_explained() -> None:
+    text, folder = PAGE.read_text(), PAGE.parent / 'values'
+    for name in next(iter(read_runs(folder).values())):
+        assert f'`{name}`' in text
+
+
+@pytest.mark.parametrize(
+    ('name', 'line'),
+    [
+        ('{}:FAILS', ':FAILS is a int; allowed: a Study'),
+        ('{}:TAKEN', "is called 'values'; allowed: a word that no other study is"),
+        ('{}:OTHER', ":OTHER: AttributeError: module '"),
+        ('nowhere_at_all:STUDY', "ModuleNotFoundError: No module named 'nowhere_at_all'"),
+        ('gaols', "module:NAME; did you mean 'goals'?"),
+    ],
+)
+def test_what_is_no_study_is_refused(
+    module: str, name: str, line: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        parse_arguments(['--study', name.format(module)])
+    assert ended.value.code == 2 and line in one_line(capsys)

@@ -1,4 +1,4 @@
-"""Runs that are interrupted, shared or killed, and invalid folders."""
+"""Runs that are interrupted, shared or killed, invalid folders, and the log of a run."""
 
 from __future__ import annotations
 
@@ -11,21 +11,18 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from dataclasses import replace
 
-import numpy as np
 import pytest
 
 from fetch_hand_sim.datasets.writing import alone_in
 from policy_node.policies import checkpoint
 from policy_node.policies.files import read_tensors
 from policy_node.training import evaluation
-from policy_node.training.experience.episode_files import load_replay, save_replay
-from policy_node.training.experience.replay import EpisodeReplay
 from policy_node.training.runs.run import lock_run
-from policy_node.training.runs.run_log import read_progress
+from policy_node.training.runs.run_log import COLUMNS, RunLog, draw_curve, read_progress
 from policy_node.training.train_her import main
+from support import wait_until
 from support.full_disk import files_at_most
 from support.runs import (
     SMALL,
@@ -183,25 +180,6 @@ def test_a_run_that_is_stopped_does_not_wait_for_an_evaluation(tmp_path):
     assert log.rows[-1].get('eval_success') is None
 
 
-def test_the_newest_episodes_are_kept_in_order(tmp_path):
-    def replay():
-        return EpisodeReplay(8, ticks=5, observation_size=3, goal_size=2, action_size=1)
-
-    first, file = replay(), tmp_path / 'replay.safetensors'
-    for number in range(13):
-        episodes = first.newest(0)
-        shapes = {name: getattr(episodes, name).shape[1:] for name in type(episodes).__slots__}
-        full = {name: np.full((1, *shape), number, np.float32) for name, shape in shapes.items()}
-        first.add(type(episodes)(**full))
-    for transitions, kept in ((0, []), (1, [12]), (15, [10, 11, 12]), (1000, list(range(5, 13)))):
-        save_replay(file, first, transitions)
-        second = replay()
-        load_replay(file, second)
-        assert second.newest(8).action[:, 0, 0].tolist() == kept
-    with pytest.raises(ValueError, match=r'replay\.safetensors'):
-        load_replay(file, EpisodeReplay(8, 5, 3, 2, action_size=4))
-
-
 def test_a_folder_that_is_being_trained_is_refused(tmp_path, capsys):
     run = tmp_path / 'run'
     with lock_run(run):
@@ -235,11 +213,8 @@ def start_run(tmp_path):
         # Without a live line.
         environment = {**os.environ, 'TERM': 'dumb'}
         started.append(process := subprocess.Popen(command, env=environment, **streams))
-        deadline = time.monotonic() + 90
         log = run / 'progress.csv'
-        while not log.is_file() or log.read_text().count('\n') < 2:
-            assert process.poll() is None and time.monotonic() < deadline
-            time.sleep(0.05)
+        wait_until(lambda: log.is_file() and log.read_text().count('\n') >= 2, 'cycle', 90.0)
         return process
 
     yield start
@@ -275,16 +250,11 @@ def test_a_closed_terminal_keeps_the_run(tmp_path, start_run):
     process = start_run(its_other_end)
     os.close(its_other_end)
     os.close(terminal)
-    log, deadline = tmp_path / 'run' / 'progress.csv', time.monotonic() + 90
+    log = tmp_path / 'run' / 'progress.csv'
     wanted = len(read_progress(log)) + 2
-    while len(read_progress(log)) < wanted:
-        assert process.poll() is None and time.monotonic() < deadline, 'it ended with its terminal'
-        time.sleep(0.05)
+    wait_until(lambda: len(read_progress(log)) >= wanted, 'cycle without a terminal', 90.0)
     # The terminal sends it, then the shell does.
-    while process.poll() is None:
-        assert time.monotonic() < deadline
-        process.send_signal(signal.SIGHUP)
-        time.sleep(0.01)
+    wait_until(lambda: process.send_signal(signal.SIGHUP) or process.poll(), 'end', 90.0)
     assert process.returncode == 128 + signal.SIGHUP
     assert_is_saved(tmp_path / 'run')
 
@@ -309,3 +279,77 @@ def test_a_full_disk_leaves_no_partial_file_and_the_checkpoint_before(tmp_path, 
         assert (tmp_path / STATE).read_bytes() == before
     trainer.save()
     assert counters_of(tmp_path)['updates'] == 20
+
+
+def row(steps, success):
+    values = dict.fromkeys(COLUMNS, 1.0)
+    return {**values, 'env_steps': steps, 'eval_success': success, 'train_success': 0.25}
+
+
+def test_a_resumed_run_goes_on_after_its_checkpoint(tmp_path):
+    for resumed_steps, steps in ((0, (100, 200, 300)), (200, (250,))):
+        log = RunLog(tmp_path, 1000, 0, resumed_steps)
+        for step in steps:
+            log.write(row(step, None if step == 100 else step / 1000))
+        log.close()
+    rows = read_progress(tmp_path / 'progress.csv')
+    assert [values['env_steps'] for values in rows] == [100, 200, 250]
+    assert 'eval_success' not in rows[0] and rows[2]['eval_success'] == 0.25
+    assert set(rows[1]) == set(COLUMNS)
+
+
+@pytest.mark.parametrize('cut', ['1,200,1', '1,200,1,,0.5,-', '1,inf,1,,0.5', '1,200,1,,nan'])
+def test_a_line_that_a_killed_run_cut_short_is_dropped(tmp_path, cut):
+    log = RunLog(tmp_path, 1000, 0)
+    log.write(row(100, 0.5))
+    log.close()
+    with (tmp_path / 'progress.csv').open('a') as file:
+        file.write(cut)
+    assert [values['env_steps'] for values in read_progress(tmp_path / 'progress.csv')] == [100]
+    RunLog(tmp_path, 1000, 0, resumed_steps=200).close()
+    assert [values['env_steps'] for values in read_progress(tmp_path / 'progress.csv')] == [100]
+
+
+def test_the_live_line_shows_the_progress(tmp_path, capsys):
+    log = RunLog(tmp_path, total_steps=7_300_000, time_limit=0)
+    log.write({**row(100_000, 0.5), 'steps_per_second': 2000.0, 'seconds': 61.0})
+    log.close()
+    line = capsys.readouterr().err
+    for part in ('100,000 steps', '2,000 steps/s', 'train 0.25', 'eval 0.500', '0:01:01'):
+        assert part in line
+    assert 'ETA 1:00:00' in line
+
+
+def test_tensorboard_holds_the_scalars(tmp_path):
+    pytest.importorskip('tensorboard')
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    log = RunLog(tmp_path, total_steps=1000, time_limit=0)
+    log.write(row(100, 0.5))
+    log.write(row(200, None))
+    log.close()
+    events = EventAccumulator(str(tmp_path / 'tensorboard'))
+    events.Reload()
+    assert [(e.step, e.value) for e in events.Scalars('eval_success')] == [(100, 0.5)]
+    assert [e.step for e in events.Scalars('train_success')] == [100, 200]
+
+
+def test_a_removed_folder_prints_no_traceback(tmp_path, capfd):
+    (tmp_path / 'run').mkdir()
+    log = RunLog(tmp_path / 'run', total_steps=1000, time_limit=0, quiet=True)
+    shutil.rmtree(tmp_path / 'run')
+    for step in range(100, 400, 100):
+        log.write(row(step, 0.5))
+    log.close()
+    assert capfd.readouterr().err == ''
+
+
+def test_the_curve_is_a_png_that_shows_the_numbers(tmp_path):
+    low = [{'env_steps': 100.0 * i, 'train_success': 0.1, 'eval_success': 0.1} for i in range(5)]
+    high = [{**row, 'eval_success': 0.9} for row in low]
+    pictures = []
+    for rows in (low, high):
+        draw_curve(rows, 'FetchReach', tmp_path / 'curve.png')
+        pictures.append((tmp_path / 'curve.png').read_bytes())
+    assert pictures[0][:8] == b'\x89PNG\r\n\x1a\n'
+    assert pictures[0] != pictures[1]

@@ -15,8 +15,6 @@ import pytest
 import torch
 
 from fetch_hand_sim.simulation.rewards import GoalMetric
-from fetch_hand_sim.simulation.tasks import registry
-from fetch_hand_sim.simulation.tasks.fetch import FETCH_CONFIGS, FetchTask
 from policy_node import load_policy
 from policy_node.training.runs.trainer import _collecting_thread
 from support import runs, script_environment
@@ -44,23 +42,16 @@ def test_a_run_leaves_an_actor_its_curve_and_the_state_of_torch(tmp_path, capfd)
     assert [row['env_steps'] for row in run.progress()] == [400.0, 800.0, 1_200.0]
     assert (tmp_path / 'run/curve.png').is_file()
     assert capfd.readouterr() == ('', '')
-
-
-class Rich(GoalMetric):
-    def reward(self, achieved_goal, desired_goal, info=None):
-        return super().reward(achieved_goal, desired_goal) + 100.0
-
-
-class RichReach(FetchTask):
-    def __init__(self, spec, batch):
-        super().__init__(spec, batch, FETCH_CONFIGS['FetchReach'])
-
-    def goal_metric(self, success_rule, reward_type):
-        return Rich(self.spec, success_rule, reward_type)
+    before = (tmp_path / 'run' / runs.STATE).read_bytes()
+    with pytest.raises(ValueError, match='resume=True'):
+        train('FetchReach', tmp_path / 'run', total_steps=400, **SMALL)
+    assert (tmp_path / 'run' / runs.STATE).read_bytes() == before
 
 
 def test_a_warning_names_rewards_above_0(tmp_path, capfd, monkeypatch):
-    monkeypatch.setattr(registry, '_family', lambda spec: RichReach)
+    reward = GoalMetric.reward
+    monkeypatch.setattr(GoalMetric, 'reward', lambda *goals, **info: reward(*goals, **info) + 100.0)
+    monkeypatch.setattr(GoalMetric, 'has_own_reward', True)
     train('FetchReach', tmp_path / 'run', total_steps=800, reward_type='dense', **SMALL)
     lines = capfd.readouterr().err.splitlines()
     (line,) = (each for each in lines if 'rewards of FetchReach' in each)
@@ -139,14 +130,6 @@ def test_an_invalid_argument_is_a_value_error_of_one_line(arguments, said, tmp_p
     assert '\n' not in str(error.value)
 
 
-def test_a_folder_that_holds_a_run_is_left_alone(tmp_path):
-    train('FetchReach', tmp_path, total_steps=400, **SMALL)
-    before = (tmp_path / 'training_state.safetensors').read_bytes()
-    with pytest.raises(ValueError, match='resume=True'):
-        train('FetchReach', tmp_path, total_steps=400, **SMALL)
-    assert (tmp_path / 'training_state.safetensors').read_bytes() == before
-
-
 def test_ctrl_c_saves_the_run_and_ends_the_program_and_a_second_one_raises_at_once(tmp_path):
     code = f"""
 import os, signal
@@ -179,20 +162,8 @@ run('never', 1)
     assert resumed.env_steps == 800
 
 
-def test_a_missing_extra_is_named(tmp_path):
-    (tmp_path / 'sitecustomize.py').write_text(
-        'import importlib.util as u\n'
-        'find = u.find_spec\n'
-        "u.find_spec = lambda name, *rest: None if name == 'torch' else find(name, *rest)\n"
-    )
-    environment = script_environment() | {'PYTHONPATH': str(tmp_path)}
-    result = subprocess.run(
-        [sys.executable, '-c', 'from policy_node.training import train'],
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
-    assert result.stderr.rstrip().endswith(
-        "ModuleNotFoundError: torch missing: pip install 'fetch_hand_sim[train]'"
-    )
+def test_a_missing_extra_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, 'torch', None)
+    message = r"torch missing: pip install 'fetch_hand_sim\[train\]'"
+    with pytest.raises(ModuleNotFoundError, match=message):
+        from policy_node.training import train  # noqa: F401

@@ -16,13 +16,12 @@ from msgs_spec.tasks import task_spec
 from policy_node import load_policy
 from policy_node.policies import checkpoint
 from policy_node.policies.policy import RandomPolicy
-from policy_node.training.evaluation import EpisodeOutcomes
 from policy_node.training.experience.episode_files import read_experience
 from policy_node.training.experience.rewards import GradedReward
 from policy_node.training.generate_episodes import main as generate_episodes
 from policy_node.training.runs.run import train_run
 from policy_node.training.runs.run_log import RunLog, read_progress
-from policy_node.training.runs.training_state import TrainingError, read_state
+from policy_node.training.runs.training_state import TrainingError, part_of, read_state
 from policy_node.training.ship_actor import main as ship_actor
 from policy_node.training.train_her import main
 from support.fresh_actor import observations
@@ -31,6 +30,7 @@ from support.runs import (
     STATE,
     one_line,
     options_of,
+    outcomes_of,
     resumed,
     same,
     small,
@@ -47,16 +47,35 @@ REACH = task_spec('FetchReach')
 RUN = ['--task', 'FetchReach', '--steps', '1200', *options_of(**SMALL)]
 
 
+def run_two_workers(*words):
+    """Run a program in two workers of one thread each; return its output."""
+    command = [sys.executable, '-m', 'torch.distributed.run', '--nproc-per-node', '2']
+    command += ['--rdzv-backend', 'c10d', '--rdzv-endpoint', 'localhost:0', *words]
+    environment = {**os.environ, 'OMP_NUM_THREADS': '1'}
+    result = subprocess.run(command, capture_output=True, text=True, timeout=1200, env=environment)
+    assert result.returncode == 0, result.stderr
+    return result.stdout
+
+
 @pytest.mark.release
-def test_fetch_reach_is_learnt_from_nothing(tmp_path):
-    arguments = ['--task', 'FetchReach', '--success-target', '1', '--steps', '40000']
-    assert main([*arguments, *THREADS, '--output', str(tmp_path / 'run')]) == 0
+@pytest.mark.parametrize('workers', [1, 2])
+def test_fetch_reach_is_learnt_from_nothing(tmp_path, workers, capsys):
+    arguments = ['--task', 'FetchReach', '--success-target', '1', '--steps', '60000', *THREADS]
+    arguments += ['--output', str(tmp_path / 'run')]
+    if workers == 1:
+        assert main(arguments) == 0
+        output = capsys.readouterr().out
+    else:
+        output = run_two_workers('-m', 'policy_node.training.train_her', *arguments)
+    assert output.count('success target 1 reached') == 1
     _, info = checkpoint.load(tmp_path / 'run' / 'best.safetensors', task='FetchReach')
     assert info.success.items() >= {'last_step': 1.0, 'episodes': 200, 'rule': 'gymnasium'}.items()
     assert info.success['stay'] > 0.9 and info.success['distance'] < 0.05
     assert info.command.startswith('fetch_hand_sim train --task FetchReach --success-target 1')
-    assert info.source_revision and 0 < info.env_steps <= 40_000
+    assert info.source_revision and 0 < info.env_steps <= 60_000
     rows = read_progress(tmp_path / 'run' / 'progress.csv')
+    # 64 simulations in all, with two workers 32 each: 64 episodes of 50 steps in a cycle.
+    assert [row['env_steps'] for row in rows[:2]] == [3200, 6400]
     assert rows[-1]['eval_success'] == 1.0 and rows[-1]['eval_stay'] > 0.9
     assert rows[0]['train_success'] < 0.5 < rows[-1]['train_success']
     assert (tmp_path / 'run' / 'curve.png').read_bytes()[:4] == b'\x89PNG'
@@ -82,15 +101,6 @@ def test_the_same_seed_gives_the_same_weights_bit_for_bit(tmp_path, overlap):
     assert not same(weights(tmp_path / 'a' / latest), weights(tmp_path / 'c' / latest))
 
 
-def test_the_latest_actor_is_the_averaged_one_that_evaluations_measure(tmp_path):
-    trained(tmp_path, total_steps=800, actor_average=0.9)
-    state = weights(tmp_path / STATE)
-    name = 'output.weight'
-    assert not torch.equal(state[f'average_actor.{name}'], state[f'actor.network.{name}'])
-    latest = checkpoint.load(tmp_path / 'latest.safetensors')[0]
-    assert torch.equal(latest.network.state_dict()[name], state[f'average_actor.{name}'])
-
-
 @pytest.mark.parametrize(
     ('changes', 'kept'),
     [
@@ -109,9 +119,13 @@ def test_the_latest_actor_is_the_averaged_one_that_evaluations_measure(tmp_path)
     ],
 )
 def test_a_run_of_every_learner_goes_on_where_it_stopped(tmp_path, changes, kept):
+    changes = {'actor_average': 0.9, **changes}
     first = trained(tmp_path, total_steps=1200, **changes)
     saved = weights(tmp_path / STATE)
     assert any(name.startswith(kept) for name in saved)
+    averaged = part_of(saved, 'average_actor')
+    assert same(averaged, checkpoint.load(tmp_path / 'latest.safetensors')[0].network.state_dict())
+    assert not same(averaged, part_of(saved, 'actor.network'))
     second = trainer_of(tmp_path, total_steps=1600, seed=9, **changes)
     fresh = second.collector.collect(second.learner.actor)[0]
     second.resume(tmp_path / STATE)
@@ -317,13 +331,8 @@ def test_the_best_actor_is_kept_and_ties_go_to_the_better_return(tmp_path):
     trainer = trainer_of(tmp_path, evaluation_episodes=4)
 
     def evaluated(steps, successes, mean_return, count=4):
-        flags = np.arange(count) < successes
         returns = np.full(count, mean_return)
-        none, nan = np.zeros(count, int), np.full(count, np.nan)
-        outcomes = EpisodeOutcomes(
-            *(np.arange(count), flags, flags, flags, returns, ~flags),
-            *(none, none, ~flags, ~flags, nan, nan),
-        )
+        outcomes = outcomes_of(np.arange(count) < successes, episode_return=returns)
         trainer.counters.env_steps = steps
         actor = trainer.learner.evaluation_actor()
         trainer._folder.keep_best(outcomes, actor, trainer.counters)
@@ -337,22 +346,39 @@ def test_the_best_actor_is_kept_and_ties_go_to_the_better_return(tmp_path):
     assert evaluated(6, 3, -20.0) == 6
 
 
+PROGRAM = """
+import pytest
+import torch
+from policy_node.training.machine import join_workers, leave_workers
+from policy_node.training.experience.experience import RunningStatistics
+from policy_node.policies.actor import Normalizer
+
+workers = join_workers(torch.device('cpu'))
+rank = workers.rank
+assert workers.world_size == 2 and workers.is_first == (rank == 0)
+
+gradients = [torch.full((2, 3), float(rank)), torch.arange(4.0) * (rank + 1)]
+workers.average_gradients(gradients)
+assert gradients[0].eq(0.5).all() and gradients[1].tolist() == [0.0, 1.5, 3.0, 4.5]
+
+weights = [torch.full((3,), float(rank + 7)), torch.full((1, 2), float(rank))]
+workers.broadcast(weights)
+assert weights[0].eq(7).all() and weights[1].eq(0).all()
+
+assert workers.any(rank == 1) and not workers.any(False)
+assert workers.share(9) == 5
+
+statistics, normalizer = RunningStatistics(1), Normalizer(1)
+statistics.update([[[1.0], [3.0]], [[5.0]]][rank], workers)
+statistics.write(normalizer)
+assert normalizer.mean.item() == 3.0 and abs(normalizer.std.item() - (8 / 3) ** 0.5) < 1e-6
+leave_workers(workers)
+"""
+
+
 @pytest.mark.release
-def test_two_workers_train_together(tmp_path):
-    run = tmp_path / 'run'
-    arguments = ['--task', 'FetchReach', '--success-target', '1', '--steps', '60000', *THREADS]
-    command = [sys.executable, '-m', 'torch.distributed.run', '--nproc-per-node', '2']
-    command += ['--master-port', '0', '--rdzv-backend', 'c10d', '--rdzv-endpoint', 'localhost:0']
-    command += ['-m', 'policy_node.training.train_her', *arguments, '--output', str(run)]
-    environment = {**os.environ, 'OMP_NUM_THREADS': '1'}
-    result = subprocess.run(command, capture_output=True, text=True, timeout=1200, env=environment)
-    assert result.returncode == 0, result.stderr
-    assert result.stdout.count('success target 1 reached') == 1
-    info = checkpoint.read_info(run / 'best.safetensors')
-    assert info.success['last_step'] == 1.0
-    rows = read_progress(run / 'progress.csv')
-    # 64 simulations in all: 32 episodes of 50 steps from each worker and cycle.
-    assert [row['env_steps'] for row in rows[:2]] == [3200, 6400]
+def test_two_workers_agree():
+    run_two_workers('--no-python', sys.executable, '-c', PROGRAM)
 
 
 @pytest.mark.parametrize(
