@@ -145,15 +145,16 @@ class Mutator:
 
     def bomb(self) -> bytes:
         """A small chunk of large uncompressed size, with a right or wrong size field."""
-        size = int(2 ** self.random.integers(20, 31))
+        size = int(2 ** self.random.integers(20, 27))
         told = int(self.random.choice([size, 2**12, 2**40]))
-        zeros = bytes(min(size, 2**26))
+        # One record of a kind that readers skip.
+        zeros = b'\x80' + struct.pack('<Q', size - 9) + bytes(size - 9)
         if self.random.random() < 0.5:
             packed, name = zstandard.ZstdCompressor(level=1).compress(zeros), 'zstd'
         else:
             packed, name = lz4.frame.compress(zeros), 'lz4'
         chunk = Chunk(name, packed, 0, 0, 0, told)
-        record = _chunk_record(chunk) * int(self.random.integers(1, 30))
+        record = _chunk_record(chunk) * int(self.random.integers(1, 200))
         offset = next(offset for offset, _ in _chunks(self.whole, self.records))
         return self.whole[:offset] + record + self.whole[offset:]
 

@@ -2,18 +2,12 @@
 
 from __future__ import annotations
 
-import errno
 import os
 import shutil
-import struct
-import subprocess
-import sys
-import time
 from io import BytesIO
 from pathlib import Path
 
 import pytest
-import zstandard
 from mcap.opcode import Opcode
 from mcap.writer import Writer
 
@@ -25,16 +19,11 @@ from fetch_hand_sim.commands import (
 )
 from fetch_hand_sim.episode_log import (
     EpisodeLogError,
-    EpisodeReadError,
     find_leftovers,
     load_episodes,
     read_episode,
-    read_summary,
     recover_episode,
 )
-from fetch_hand_sim.replay_node.schedule import ReplaySchedule
-from msgs_spec.schemas import schema_text
-from support import script_environment
 
 NAME = 'FetchReach_000000_seed0'
 
@@ -65,37 +54,22 @@ def assert_one_line_each(text, count):
 # Bad entries hide no good episode
 
 
-def bad_leftover(directory, kind):
-    """Makes an entry `.bad.active` that no robot leaves."""
-    bad = directory / '.bad.active'
-    match kind:
-        case 'fifo inside':
-            bad.mkdir()
-            os.mkfifo(bad / 'bad_0.mcap')
-        case 'unknown fifo inside':
-            os.mkfifo(leave(directory, 'bad', b'') / 'pipe')
-        case 'fifo':
-            os.mkfifo(bad)
-        case 'file':
-            bad.write_text('no directory')
-        case 'folder inside':
-            (bad / 'bad_0.mcap').mkdir(parents=True)
-        case 'link to itself':
-            bad.symlink_to(bad)
-        case 'link elsewhere':
-            bad.symlink_to(directory / NAME)
-
-
-BAD_LEFTOVERS = (
-    *('fifo inside', 'unknown fifo inside', 'fifo', 'file', 'folder inside'),
-    *('link to itself', 'link elsewhere'),
-)
+# Functions that make an entry which no robot leaves.
+BAD_LEFTOVERS = {
+    'pipe inside': lambda bad: (bad.mkdir(), os.mkfifo(bad / 'bad_0.mcap')),
+    'unknown pipe inside': lambda bad: os.mkfifo(leave(bad.parent, 'bad', b'') / 'pipe'),
+    'pipe': os.mkfifo,
+    'file': lambda bad: bad.write_text('no directory'),
+    'folder inside': lambda bad: (bad / 'bad_0.mcap').mkdir(parents=True),
+    'link to itself': lambda bad: bad.symlink_to(bad),
+    'link elsewhere': lambda bad: bad.symlink_to(bad.parent / NAME),
+}
 
 
 @pytest.mark.timeout(20)
-@pytest.mark.parametrize('kind', BAD_LEFTOVERS)
-def test_a_bad_entry_hides_no_good_one(directory, kind, capsys):
-    bad_leftover(directory, kind)
+@pytest.mark.parametrize('make', BAD_LEFTOVERS.values(), ids=BAD_LEFTOVERS)
+def test_a_bad_entry_hides_no_good_one(directory, make, capsys):
+    make(directory / '.bad.active')
     bad, good = find_leftovers(directory)
     assert bad.problem and not good.problem
     assert episodes_list.main([str(directory)]) == 0
@@ -128,19 +102,6 @@ def test_links_in_a_leftover_are_not_followed(directory, tmp_path, link):
 # A leftover that is damaged or not of a robot
 
 
-def cut_with(metadata, type_name='std_msgs/msg/Float64', **options):
-    """A file with one message of `reward`, as a killed robot leaves it."""
-    stream = BytesIO()
-    writer = Writer(stream, **options)
-    writer.start(profile='ros2')
-    writer.add_metadata('episode', {'task': 'FetchReach'})
-    schema = writer.register_schema(type_name, 'ros2msg', schema_text(type_name).encode())
-    channel = writer.register_channel('/reward', 'cdr', schema, metadata)
-    writer.add_message(channel, 1, bytes(12), 1)
-    writer.flush()
-    return stream.getvalue()
-
-
 def flipped(data, position, bit=6):
     return data[:position] + bytes([data[position] ^ 1 << bit]) + data[position + 1 :]
 
@@ -155,35 +116,21 @@ def chunks(data):
     return found
 
 
-def bomb():
-    """Chunks of 15 MiB of zeros that have 1 KB each."""
-    zeros = bytes([Opcode.HEADER]) + struct.pack('<Q', 60 * 2**20 - 9) + bytes(60 * 2**20 - 9)
-    packed = zstandard.compress(zeros)
-    sizes = struct.pack('<QQQI', 0, 0, len(zeros), 0)
-    content = sizes + struct.pack('<I', 4) + b'zstd' + struct.pack('<Q', len(packed)) + packed
-    chunk = bytes([Opcode.CHUNK]) + struct.pack('<Q', len(content)) + content
-    return cut_with({}) + 200 * chunk
-
-
-@pytest.mark.timeout(60)
-def test_one_bad_leftover_stops_no_other_and_loses_no_byte(directory, finished, capsys):
-    whole = (finished / f'{NAME}_0.mcap').read_bytes()[:-2000]
-    start = chunks(whole)[0]
-    bad = {
-        'another type': ('active', cut_with({}, 'std_msgs/msg/Empty')),
-        'flipped length of the first chunk': ('aside', flipped(whole, start + 4)),
-        'flipped length of the header': ('aside', flipped(whole, 8 + 4)),
-    }
-    for name, (_, data) in bad.items():
-        leave(directory, name, data)
-    began = time.process_time()
+def test_a_leftover_with_a_topic_of_another_type_stays_and_stops_no_other(directory, capsys):
+    stream = BytesIO()
+    writer = Writer(stream)
+    writer.start(profile='ros2')
+    writer.add_metadata('episode', {'task': 'FetchReach'})
+    schema = writer.register_schema('std_msgs/msg/Empty', 'ros2msg', b'')
+    writer.add_message(writer.register_channel('/reward', 'cdr', schema), 1, bytes(12), 1)
+    writer.flush()
+    leave(directory, 'bad', stream.getvalue())
     assert episodes_recover.main([str(directory)]) == 1
-    assert time.process_time() - began < 5.0
     output = capsys.readouterr()
     assert 'recovered' in output.out and read_episode(directory / 'cut')
     assert_one_line_each(output.err, 1)
-    for name, (end, data) in bad.items():
-        assert (directory / f'.{name}.{end}' / f'{name}_0.mcap').read_bytes() == data
+    assert "no topic '/reward' of type" in output.err
+    assert (directory / '.bad.active' / 'bad_0.mcap').read_bytes() == stream.getvalue()
 
 
 def test_recovery_keeps_unreadable_files_aside(directory, finished):
@@ -197,62 +144,22 @@ def test_recovery_keeps_unreadable_files_aside(directory, finished):
     assert find_leftovers(directory)[0].name == 'cut'
 
 
-def test_chunks_that_unpack_to_gigabytes_cost_little(tmp_path):
-    leave(tmp_path, 'bomb', bomb())
-    script = (
-        'import sys, time\n'
-        'from pathlib import Path\n'
-        'from fetch_hand_sim.commands import episodes_recover\n'
-        'code = episodes_recover.main([sys.argv[1]])\n'
-        # ru_maxrss would include the memory of the process that starts this one.
-        'status = Path("/proc/self/status").read_text().splitlines()\n'
-        '(peak,) = (line.split()[1] for line in status if line.startswith("VmHWM:"))\n'
-        'print(peak, time.process_time())\n'
-    )
-    command = [sys.executable, '-c', script, tmp_path]
-    run = subprocess.run(command, capture_output=True, text=True, env=script_environment())
-    kilobytes, seconds = run.stdout.splitlines()[-1].split()
-    assert int(kilobytes) < 500_000 and float(seconds) < 4.0, run.stdout + run.stderr
-
-
-def test_an_episode_without_messages_cannot_be_replayed(tmp_path):
-    path = tmp_path / 'empty.mcap'
-    with path.open('wb') as stream:
-        writer = Writer(stream)
-        writer.start(profile='ros2')
-        writer.add_metadata('episode', {'task': 'FetchReach', 'control_hz': '25.0'})
-        writer.add_metadata('episode_result', {'complete': 'true'})
-        writer.finish()
-    with pytest.raises(EpisodeReadError, match='an episode without messages'):
-        ReplaySchedule(path)
-    assert episodes_check.main([str(path)]) == 2
-
-
 # Paths
 
 
-def test_names_that_are_no_text_and_command_a_terminal(finished, tmp_path):
-    """Through real processes, since it is their output that must take them."""
+def test_names_that_are_no_text_and_command_a_terminal(finished, tmp_path, capsys):
     name = b'\xff\xfe \x1b]0;owned\x07 line\nbreak'
     directory = Path(os.fsdecode(os.fsencode(tmp_path) + b'/' + name))
     shutil.copytree(finished, directory / NAME)
     leave(directory, 'cut', (finished / f'{NAME}_0.mcap').read_bytes()[:-2000])
     (directory / 'text.mcap').write_text('no bag')
-    parquet = ['--to', 'parquet', '--output', str(directory / 'out')]
-    for command, arguments, code in (
-        ('list', [], 1),
-        ('recover', [], 0),
-        ('export', parquet, 1),
-    ):
-        run = subprocess.run(
-            [sys.executable, '-m', 'fetch_hand_sim', 'episodes', command, directory, *arguments],
-            capture_output=True,
-            env=script_environment() | {'PYTHONIOENCODING': 'utf-8'},
-        )
-        output = (run.stdout + run.stderr).decode()
-        assert run.returncode == code, (command, output)
-        assert 'Traceback' not in output
-        assert all(line.isprintable() for line in output.splitlines())
+    export = ['--to', 'parquet', '--output', str(directory / 'out')]
+    assert episodes_list.main([str(directory)]) == 1
+    assert episodes_recover.main([str(directory)]) == 0
+    assert episodes_export.main([str(directory), *export]) == 1
+    output = capsys.readouterr()
+    assert len(output.out.splitlines()) > 4 and len(output.err.splitlines()) == 2
+    assert all(line.isprintable() for line in (output.out + output.err).splitlines())
 
 
 def test_companion_files_of_macos_are_ignored(finished, tmp_path, capsys):
@@ -267,19 +174,6 @@ def test_companion_files_of_macos_are_ignored(finished, tmp_path, capsys):
     assert episodes_list.main([str(tmp_path)]) == episodes_check.main([str(tmp_path)]) == 0
     assert '2 episodes' in capsys.readouterr().out
     assert len(load_episodes(tmp_path)) == 2
-
-
-def test_a_folder_without_permission_is_one_line(finished, monkeypatch):
-    """Such as those that root has logged in a container."""
-
-    def refuse(path):
-        raise PermissionError(errno.EACCES, 'Permission denied', path)
-
-    monkeypatch.setattr(os, 'scandir', refuse)
-    monkeypatch.setattr(os, 'listdir', refuse)
-    for read in (read_episode, read_summary, load_episodes):
-        with pytest.raises(EpisodeReadError, match=f'{NAME}: Permission denied'):
-            read(finished)
 
 
 def test_too_long_a_name_is_one_line(capsys):

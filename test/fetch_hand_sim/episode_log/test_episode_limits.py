@@ -184,6 +184,14 @@ def test_small_files_of_very_many_messages_cost_little(tmp_path):
         read_episode(path)
 
 
+def test_an_episode_without_messages_cannot_be_replayed(tmp_path):
+    path = bag_of(tmp_path / 'x.mcap', 0)
+    with pytest.raises(EpisodeReadError, match='an episode without messages'):
+        ReplaySchedule(path)
+    with pytest.raises(EpisodeReadError, match='without messages'):
+        check_episode(path)
+
+
 def test_limits_hold_together():
     """The allowance of one topic leaves room for the others and for the ticks."""
     assert 4 * limits.MAX_RECEIVED_MESSAGES < limits.MAX_MESSAGES

@@ -324,15 +324,15 @@ def unprivileged():
 
 @pytest.mark.parametrize('mode', [0o555, 0o000])
 def test_a_directory_without_permission(mode):
-    with tempfile.TemporaryDirectory() as directory:
-        os.chmod(directory, mode)
-        calls = [lambda: EpisodeDirectory(Path(directory)).begin('FetchReach', 0, {})]
-        calls += [lambda: find_leftovers(Path(directory))] if not mode else []
-        for call in calls:
-            with unprivileged(), pytest.raises(EpisodeLogError, match='Permission denied') as error:
-                call()
+    reads = [find_leftovers, read_episode, read_summary, load_episodes] if not mode else []
+    with tempfile.TemporaryDirectory() as name:
+        os.chmod(name, mode)
+        for call in (lambda path: EpisodeDirectory(path).begin('FetchReach', 0, {}), *reads):
+            with unprivileged(), pytest.raises((EpisodeLogError, EpisodeReadError)) as error:
+                call(Path(name))
+            assert name in str(error.value) and str(error.value).endswith('Permission denied')
             assert_one_line(error.value)
-        assert os.listdir(directory) == []
+        assert os.listdir(name) == []
 
 
 def test_a_directory_that_is_a_file(tmp_path):

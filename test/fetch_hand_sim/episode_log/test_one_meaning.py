@@ -9,7 +9,22 @@ import time
 from pathlib import Path
 
 import pytest
+from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
+from mcap.records import (
+    Channel,
+    Chunk,
+    ChunkIndex,
+    DataEnd,
+    Footer,
+    Header,
+    Message,
+    MessageIndex,
+    Metadata,
+    MetadataIndex,
+    Schema,
+    Statistics,
+)
 from mcap.writer import MCAP0_MAGIC, CompressionType
 
 from fetch_hand_sim.episode_log import (
@@ -43,57 +58,47 @@ def parts(finished):
     return Parts(finished)
 
 
-def record(opcode, content):
+def raw(opcode, content):
+    """A record of any content."""
     return bytes([opcode]) + struct.pack('<Q', len(content)) + content
 
 
-def text(value):
-    return struct.pack('<I', len(value.encode())) + value.encode()
-
-
-def strings(content):
-    pairs = b''.join(text(key) + text(value) for key, value in content.items())
-    return struct.pack('<I', len(pairs)) + pairs
+def record(content):
+    builder = RecordBuilder()
+    content.write(builder)
+    return builder.end()
 
 
 def metadata(name, content):
-    return record(Opcode.METADATA, text(name) + strings(content))
+    return record(Metadata(name, content))
 
 
 def chunk(*records, times=(0, 0)):
     data = b''.join(records)
-    sizes = struct.pack('<QQQI', *times, len(data), 0) + text('') + struct.pack('<Q', len(data))
-    return record(Opcode.CHUNK, sizes + data)
+    return record(Chunk('', data, times[1], times[0], 0, len(data)))
 
 
 def schema(id, name, definition):
-    data = struct.pack('<I', len(definition)) + definition.encode()
-    return record(Opcode.SCHEMA, struct.pack('<H', id) + text(name) + text('ros2msg') + data)
+    return record(Schema(id, definition.encode(), 'ros2msg', name))
 
 
 def channel(id, schema_id, topic, encoding='cdr'):
-    content = struct.pack('<HH', id, schema_id) + text(topic) + text(encoding) + strings({})
-    return record(Opcode.CHANNEL, content)
+    return record(Channel(id, topic, encoding, {}, schema_id))
 
 
 def message(id, log_time, data, publish_time=None, sequence=0):
     publish_time = log_time if publish_time is None else publish_time
-    return record(Opcode.MESSAGE, struct.pack('<HIQQ', id, sequence, log_time, publish_time) + data)
-
-
-def statistics(count, first, last):
-    return record(
-        Opcode.STATISTICS, struct.pack('<QHIIIIQQI', count, 0, 0, 0, 0, 0, first, last, 0)
-    )
+    return record(Message(id, log_time, data, publish_time, sequence))
 
 
 def whole(*data, summary=()):
     """An MCAP file without CRCs."""
-    start = MCAP0_MAGIC + record(Opcode.HEADER, text('ros2') + text('test')) + b''.join(data)
-    start += record(Opcode.DATA_END, bytes(4))
-    summary_start = len(start) if summary else 0
-    footer = record(Opcode.FOOTER, struct.pack('<QQI', summary_start, 0, 0))
+    start = MCAP0_MAGIC + HEADER + b''.join(data) + record(DataEnd(0))
+    footer = record(Footer(len(start) if summary else 0, 0, 0))
     return start + b''.join(summary) + footer + MCAP0_MAGIC
+
+
+HEADER = record(Header('ros2', 'test'))
 
 
 class Parts:
@@ -159,39 +164,34 @@ def changed_record(name, content, changes):
 
 def longer(opcode, records):
     """Records with bytes after their last field."""
-    return [record(opcode, each[9:] + b'x') for each in records]
+    return [raw(opcode, each[9:] + b'x') for each in records]
 
 
 def a_key_twice(parts):
-    pairs = text('return') + text('0.0')
-    content = text('episode_result') + struct.pack('<I', 2 * len(pairs)) + 2 * pairs
-    return whole(parts.record, chunk(), record(Opcode.METADATA, content))
+    result = metadata('episode_result', {'return': '0.0', 'RETURN': '0.0'})
+    return whole(parts.record, chunk(), result.replace(b'RETURN', b'return'))
 
 
 def index_of_a_decoy(parts):
-    index = struct.pack('<QQ', 30, 100) + text('episode_result')
-    return parts.file(summary=[record(Opcode.METADATA_INDEX, index)])
+    return parts.file(summary=[record(MetadataIndex(30, 100, 'episode_result'))])
 
 
 def chunk_index_that_leaves_out(parts):
     first = parts.file()
-    start = len(MCAP0_MAGIC) + len(record(Opcode.HEADER, text('ros2') + text('test')))
-    start += len(parts.record)
-    (length,) = struct.unpack_from('<Q', first, start + 1)
-    head = struct.unpack_from('<QQQ', first, start + 9)
-    sizes = struct.pack('<Q', 0) + text('') + struct.pack('<QQ', head[2], head[2])
-    index = struct.pack('<QQQQI', 0, 0, start, length + 9, 0) + sizes
-    return parts.file(parts.late_reward, summary=[record(Opcode.CHUNK_INDEX, index)])
+    start = len(MCAP0_MAGIC + HEADER + parts.record)
+    length, *times, size = struct.unpack_from('<QQQQ', first, start + 1)
+    index = ChunkIndex(length + 9, start, '', size, times[1], 0, {}, times[0], size)
+    return parts.file(parts.late_reward, summary=[record(index)])
 
 
 def message_index_that_leaves_out(parts):
-    entry = struct.pack('<QQ', parts.rows[0][0], 0)
-    index = struct.pack('<HI', parts.rows[0][1], len(entry)) + entry
-    return parts.file(record(Opcode.MESSAGE_INDEX, index))
+    first_ns, id, _ = parts.rows[0]
+    return parts.file(record(MessageIndex(id, [(first_ns, 0)])))
 
 
 def with_statistics(parts, count=None, last=None, records=1):
-    found = statistics(count or len(parts.rows), parts.rows[0][0], last or parts.last_ns)
+    count, last = count or len(parts.rows), last or parts.last_ns
+    found = record(Statistics(0, 0, {}, 0, count, last, parts.rows[0][0], 0, 0))
     return parts.file(summary=[found] * records)
 
 
@@ -271,11 +271,11 @@ AMBIGUOUS = [
     ('comes before its schema', lambda p: p.file(schemas=p.channels, channels=p.schemas)),
     (
         'header record before the end of the data',
-        lambda p: p.file(record(Opcode.HEADER, text('') + text(''))),
+        lambda p: p.file(record(Header('', ''))),
     ),
     (
         'a message is shorter than its header',
-        lambda p: p.file(messages=[record(Opcode.MESSAGE, struct.pack('<H', 1))]),
+        lambda p: p.file(messages=[raw(Opcode.MESSAGE, bytes(2))]),
     ),
     (
         'more than 16 metadata records',
@@ -435,10 +435,10 @@ def test_long_and_repeated_names_make_short_lines(parts, tmp_path):
 
 def test_many_small_records_cost_little(parts, tmp_path):
     path = tmp_path / 'file.mcap'
-    empty = record(Opcode.METADATA, text('x') + struct.pack('<I', 2**20 - 104) + bytes(2**20 - 104))
-    pairs = b''.join(text(str(number)) + text('') for number in range(60_000))
-    many = record(Opcode.METADATA, text('y') + struct.pack('<I', len(pairs)) + pairs)
-    headers = record(Opcode.HEADER, bytes(8)) * 250_000
+    many = metadata('y', {str(number): '' for number in range(60_000)})
+    # The space of a record filled with empty strings.
+    empty = raw(Opcode.METADATA, many[9:14] + struct.pack('<I', 2**20 - 104) + bytes(2**20 - 104))
+    headers = raw(Opcode.HEADER, bytes(8)) * 250_000
     for extra in ((empty,) * 12, (many,) * 12, (headers,)):
         path.write_bytes(parts.file(*extra))
         began = time.process_time()
