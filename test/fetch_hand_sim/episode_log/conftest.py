@@ -9,6 +9,25 @@ from pathlib import Path
 import pytest
 
 
+@pytest.fixture(scope='session')
+def recorder():
+    """A recorder of FetchReach; its metadata stay those of its first episode, `ticks`."""
+    # Imported late: the environment of ROS is set before message classes are imported.
+    from support.episode_recorder import Recorder
+
+    recorder = Recorder('FetchReach')
+    metadata = recorder.metadata()
+    recorder.metadata = lambda started=None: metadata
+    recorder.first_ticks = recorder.ticks()
+    return recorder
+
+
+@pytest.fixture(scope='session')
+def ticks(recorder):
+    """One episode."""
+    return recorder.first_ticks
+
+
 @pytest.fixture
 def mount():
     """Makes small file systems; needs the right to mount."""

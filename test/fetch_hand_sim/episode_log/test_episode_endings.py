@@ -186,13 +186,3 @@ def test_a_robot_under_nohup_survives_its_terminal(start_process):
         robot.send_signal(signal.SIGHUP)
         ticks_after(listener)
     end(robot)
-
-
-def test_a_pipe_among_the_leftovers_does_not_block(start_process, tmp_path):
-    (tmp_path / '.bad.active').mkdir()
-    os.mkfifo(tmp_path / '.bad.active' / 'bad_0.mcap')
-    arguments = ros_args(episode_dir=tmp_path, episodes=1, real_time_factor=0.0)
-    code, output = finish(start_process(*SIM_NODE, *arguments))
-    assert code == 0
-    assert 'bad_0.mcap: is no regular file' in output
-    assert len(find_episodes(tmp_path)) == 1

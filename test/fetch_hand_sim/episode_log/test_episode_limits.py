@@ -24,7 +24,6 @@ from fetch_hand_sim.episodes.checker import check_episode
 from fetch_hand_sim.replay_node.schedule import ReplaySchedule
 from msgs_spec.schemas import MAX_MESSAGE_BYTES
 from msgs_spec.topics import topic
-from support.episode_recorder import Recorder
 
 MIB = 2**20
 # Topics and sizes of messages that a robot receives while it is paused at its third tick.
@@ -40,20 +39,6 @@ FLOODS = {
         for _ in range(limits.MAX_RECEIVED_MESSAGES)
     ],
 }
-
-
-@pytest.fixture(scope='module')
-def recorder():
-    recorder = Recorder('FetchReach')
-    # Of the first episode, which is the one that all tests write.
-    metadata = recorder.metadata()
-    recorder.metadata = lambda: metadata
-    return recorder
-
-
-@pytest.fixture(scope='module')
-def ticks(recorder):
-    return recorder.ticks()
 
 
 def write(directory, recorder, ticks, flood):

@@ -8,7 +8,7 @@ from fetch_hand_sim.episode_log import EpisodeOutcome, EpisodeRecord, episode_me
 from msgs_spec.tasks import TASKS
 
 
-def metadata(**changes: str) -> dict[str, str]:
+def metadata(hz: float = 500 / 3, **changes: str) -> dict[str, str]:
     """The record of an episode of FetchPush, with changes."""
     values = episode_metadata(
         TASKS['FetchPush'],
@@ -16,7 +16,7 @@ def metadata(**changes: str) -> dict[str, str]:
         seed=2**63 - 1,
         reward_type='dense',
         success_rule='paper',
-        control_hz=500 / 3,
+        control_hz=hz,
         model_sha256='0',
     )
     return {**values, **changes}
@@ -35,16 +35,7 @@ def test_a_record_without_timing_kept_ticks():
     old = metadata()
     del old['timing']
     assert EpisodeRecord.parse(old).timing == 'ticks'
-    at_25_hz = episode_metadata(
-        TASKS['FetchPush'],
-        episode=3,
-        seed=0,
-        reward_type='dense',
-        success_rule='paper',
-        control_hz=25.0,
-        model_sha256='0',
-    )
-    assert 'timing' not in at_25_hz, 'files at 25 Hz are as they were'
+    assert 'timing' not in metadata(hz=25.0), 'files at 25 Hz are as they were'
 
 
 @pytest.mark.parametrize(
