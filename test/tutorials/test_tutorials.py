@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from support import ROOT
-from support.tutorial import Block, Reader, blocks, missing_line
+from support.tutorial import Reader, missing_line
 
 PAGES = sorted((ROOT / 'docs' / 'tutorials').glob('*.md'))
 
@@ -25,18 +25,6 @@ def test_a_tutorial_can_be_followed(
 ) -> None:
     path = os.pathsep.join([str(Path(sys.executable).parent), ros_environment['PATH']])
     Reader(tmp_path, ros_environment | {'PATH': path}).follow(page.read_text(encoding='utf-8'))
-
-
-def test_blocks_are_distinguished() -> None:
-    page = (
-        'a\n\n```sh\nx\n```\n```sh second terminal\ny\n```\n```\nout\n```\n```python a.py\nb\n```\n'
-    )
-    assert blocks(page) == [
-        Block('sh', '', 'x\n'),
-        Block('sh', 'second terminal', 'y\n'),
-        Block('', '', 'out\n'),
-        Block('python', 'a.py', 'b\n'),
-    ]
 
 
 @pytest.mark.parametrize(
@@ -56,7 +44,7 @@ def test_output_is_compared_with_the_page(expected: str, missing: str | None) ->
 @pytest.mark.parametrize(
     ('page', 'problem'),
     [
-        ('```sh\nfalse\n```\n', 'false'),
+        ('```python a.sh\necho broken; false\n```\n```sh\nsh a.sh\n```\n', 'broken'),
         ('```sh\necho a\n```\n```\nb\n```\n', "the page shows 'b'"),
         ("```python\nraise SystemExit('no')\n```\n", 'no'),
         ('```sh other\ncat nosuchfile\n```\n```sh\nsleep 0.2\n```\n', 'nosuchfile'),

@@ -12,21 +12,17 @@ import pytest
 from fetch_hand_sim.commands.node_processes import executable, is_actor_shipped
 
 
-def test_an_executable_runs_with_its_arguments_and_exit_code(tmp_path):
-    command = [*executable('fetch_hand_sim'), 'episodes', 'list', tmp_path]
-    result = subprocess.run(command, capture_output=True, text=True)
-    assert (result.returncode, result.stderr) == (0, '')
-    assert result.stdout.startswith('0 episodes')
-    missing = subprocess.run([*command[:-1], tmp_path / 'none'], capture_output=True, text=True)
-    assert missing.returncode == 2 and 'none' in missing.stderr
-
-
-def test_python_files_of_the_working_directory_are_not_run(tmp_path):
+def test_an_executable_runs_with_its_exit_code_and_no_python_file_of_its_folder(tmp_path):
     for name in ('random', 'numpy', 'yaml'):
         (tmp_path / f'{name}.py').write_text('raise RuntimeError("not asked for")')
-    command = [*executable('fetch_hand_sim'), 'episodes', 'list', tmp_path]
-    result = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
-    assert (result.returncode, result.stderr) == (0, '')
+    for folder, code, output, error in (
+        ('.', 0, '0 episodes', ''),
+        ('none', 2, '', 'fetch_hand_sim episodes list: none'),
+    ):
+        command = [*executable('fetch_hand_sim'), 'episodes', 'list', folder]
+        result = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
+        assert result.returncode == code and result.stdout.startswith(output)
+        assert result.stderr.startswith(error) and result.stderr.count('\n') == bool(error)
 
 
 @pytest.mark.parametrize('closed', [1, 2])

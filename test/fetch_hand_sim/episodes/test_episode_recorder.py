@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 
@@ -48,11 +48,12 @@ def recorder_into(
     directory: Path,
     on_error: Callable[[str], object],
     on_slow: Callable[[str], None] = lambda line: None,
+    metadata: Mapping[str, str] = METADATA,
 ) -> EpisodeRecorder:
     """A recorder as a robot has it."""
     return EpisodeRecorder(
         directory,
-        metadata=lambda status: METADATA,
+        metadata=lambda status: dict(metadata),
         on_error=on_error,
         on_logged=lambda episode: None,
         on_slow=on_slow,
@@ -118,12 +119,7 @@ def test_metadata_are_those_of_the_moment_in_which_an_episode_begins(
 
     monkeypatch.setattr(EpisodeDirectory, 'begin', late)
     metadata = dict(METADATA)
-    recorder = EpisodeRecorder(
-        tmp_path,
-        metadata=lambda status: dict(metadata),
-        on_error=print,
-        on_logged=lambda logged: None,
-    )
+    recorder = recorder_into(tmp_path, pytest.fail, metadata=metadata)
     recorder.record(*ticks[0])
     metadata['checkpoint_sha256'] = 'f' * 64
     opened.set()
@@ -210,18 +206,6 @@ def test_closing_waits_for_a_stuck_disk_until_the_user_gives_up(
     assert recorder.has_failed
 
 
-def test_a_disk_error_in_the_writing_thread_is_reported_once(
-    tmp_path: Path, ticks: Ticks, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def fail(writer: EpisodeWriter, stamp_ns: int, messages: Messages) -> bool:
-        raise EpisodeLogError('episode log stopped: disk gone')
-
-    monkeypatch.setattr(EpisodeWriter, 'write_tick', fail)
-    errors, _ = record(tmp_path / 'recorder', ticks, pause=0.01)
-    assert errors == ['episode log stopped: disk gone']
-    assert not [path for path in (tmp_path / 'recorder').iterdir() if path.name[0] != '.']
-
-
 def test_messages_of_a_paused_robot_are_flushed_without_a_tick(
     tmp_path: Path, ticks: Ticks
 ) -> None:
@@ -245,15 +229,16 @@ def chunks(path: Path) -> list[Chunk]:
     return found
 
 
-def test_a_failed_recorder_uses_no_processor_time(
-    tmp_path: Path, ticks: Ticks, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize('step', ['write_tick', 'store'])
+def test_a_disk_error_in_either_thread_is_reported_once_and_leaves_no_work(
+    tmp_path: Path, ticks: Ticks, monkeypatch: pytest.MonkeyPatch, step: str
 ) -> None:
     """Tasks that are queued after the failure are neither run nor waited for."""
 
-    def fail(writer: EpisodeWriter) -> Path:
+    def fail(*_: object) -> None:
         raise EpisodeLogError('episode log stopped: disk full')
 
-    monkeypatch.setattr(EpisodeWriter, 'store', fail)
+    monkeypatch.setattr(EpisodeWriter, step, fail)
     errors: list[str] = []
     recorder = recorder_into(tmp_path, errors.append)
     for tick in (*ticks, ticks[0]):
@@ -265,6 +250,7 @@ def test_a_failed_recorder_uses_no_processor_time(
     assert time.process_time() - began < 0.25
     recorder.close('end')
     assert errors == ['episode log stopped: disk full']
+    assert not [path for path in tmp_path.iterdir() if path.name[0] != '.']
 
 
 def test_closing_after_a_disk_error_waits_no_longer_than_the_limit(

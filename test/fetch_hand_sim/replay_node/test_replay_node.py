@@ -143,8 +143,11 @@ def test_every_message_comes_back_as_recorded_with_its_timing(start_process, fin
     assert np.median(np.diff(times)) == pytest.approx(0.04, abs=0.004)
 
 
-def test_late_subscribers_get_the_latched_topics_of_an_offset(start_process, finished):
-    start_process(*REPLAY_NODE, *ros_args(path=finished, start_offset=1.0, start_paused=True))
+def test_late_subscribers_get_the_latched_topics_of_an_offset_until_it_is_interrupted(
+    start_process, finished
+):
+    arguments = ros_args(path=finished, start_offset=1.0, start_paused=True)
+    replay = start_process(*REPLAY_NODE, *arguments)
     with client(REACH) as listener:
         listener.subscribe('desired_goal', 'episode_status', 'joint_states')
         listener.spin_until(lambda: bool(listener.received['desired_goal']), 'the latched goal')
@@ -156,6 +159,9 @@ def test_late_subscribers_get_the_latched_topics_of_an_offset(start_process, fin
         listener.call(SetBool, 'replay_node/pause', data=False)
         listener.spin_until(lambda: bool(listener.received['joint_states']), 'a tick')
         assert message_stamp(listener.received['joint_states'][0]) == 2_000_000_000
+        listener.call(SetBool, 'replay_node/pause', data=True)
+    replay.send_signal(signal.SIGINT)
+    assert_ends_well(replay, '; paused until ~/pause is called with false')
 
 
 @pytest.mark.alone
@@ -211,17 +217,6 @@ def assert_ends_well(replay, said=''):
     assert 'real time; topics in /' in output and output.endswith(f'{said}\n')
 
 
-def test_an_interrupted_replay_prints_one_line(start_process, finished):
-    arguments = ros_args(path=finished, wait_for_commands=True, start_paused=True)
-    replay = start_process(*REPLAY_NODE, *arguments)
-    with client(REACH) as listener:
-        listener.subscribe('episode_status')
-        listener.spin_until(lambda: bool(listener.received['episode_status']), 'what is latched')
-        replay.send_signal(signal.SIGINT)
-        line = '2.00 s, at 1 x real time; topics in /; waits for commands; paused until ~/pause'
-        assert_ends_well(replay, f'{line} is called with false')
-
-
 @pytest.mark.alone
 def test_a_hanging_callback_delays_the_end_by_one_second(start_process, finished):
     """Not for one per topic."""
@@ -263,7 +258,8 @@ def test_in_a_namespace_it_replays_a_robot_of_that_namespace(start_process, fini
         commands = topic(REACH, 'commands')
         node.create_publisher(ros_message_class(commands.type_name), '/left/commands', 10)
         listener.call(SetBool, '/left/replay_node/pause', data=False)
-        assert_ends_well(replay)
+        line = '2.00 s, at 1 x real time; topics in /left; waits for commands; paused until'
+        assert_ends_well(replay, f'{line} ~/pause is called with false')
 
 
 @pytest.mark.release
