@@ -15,7 +15,6 @@ from gymnasium.utils.env_checker import check_env
 
 import fetch_hand_sim
 from fetch_hand_sim.gym_envs.env import FetchHandEnv
-from fetch_hand_sim.gym_envs.gymnasium_robotics_env import FetchEnv
 from fetch_hand_sim.gym_envs.registration import environment_id
 from fetch_hand_sim.simulation import rendering
 from fetch_hand_sim.simulation.opengl import prepare_opengl
@@ -36,42 +35,6 @@ def test_gymnasiums_checker_is_content(task):
     assert env.spec.id == f'fetch_hand_sim/{task}-v0'
     assert env.spec.max_episode_steps == TASKS[task].episode_ticks
     check_env(env.unwrapped, skip_render_check=True)
-
-
-class Demanding:
-    """Goals, observations, successes, rewards and endings of a user."""
-
-    def _sample_goal(self):
-        return np.array([1.3, 0.7, 0.6])
-
-    def _get_obs(self):
-        observation = super()._get_obs()
-        return observation | {'observation': 0.0 * observation['observation']}
-
-    def _is_success(self, achieved_goal, desired_goal):
-        return desired_goal[0] == 1.3
-
-    def compute_reward(self, achieved_goal, desired_goal, info=None):
-        return -2.0 * np.linalg.norm(achieved_goal - desired_goal, axis=-1)
-
-    def compute_terminated(self, achieved_goal, desired_goal, info):
-        return info['is_success']
-
-    def compute_truncated(self, achieved_goal, desired_goal, info):
-        return True
-
-
-@pytest.mark.parametrize('base', [FetchHandEnv, FetchEnv])
-def test_the_methods_of_a_subclass_count(base):
-    env = type('Mine', (Demanding, base), {})('FetchReach')
-    for _ in range(2):
-        observation, _ = env.reset(seed=0)
-        assert observation['desired_goal'].tolist() == env.goal.tolist() == [1.3, 0.7, 0.6]
-        assert not observation['observation'].any()
-        observation, reward, terminated, truncated, info = env.step(np.zeros(4, np.float32))
-        assert not observation['observation'].any()
-        assert (terminated, truncated, info['is_success']) == (True, True, True)
-        assert reward == env.compute_reward(observation['achieved_goal'], env.goal) > -2.0
 
 
 def test_goals_are_given_with_a_reset_or_written():
