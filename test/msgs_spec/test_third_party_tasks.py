@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -20,33 +20,23 @@ def test_an_episode_has_a_tick_at_any_rate(monkeypatch: pytest.MonkeyPatch) -> N
     assert task_spec(PUSH.name, control_hz=12.5).episode_ticks == 1
 
 
-@dataclass
-class Point:
+def point(package: str, name: str, given: Any) -> Any:
     """An entry point of a third-party package, with the name of its task."""
 
-    package: str
-    name: str
-    given: Any
+    def load() -> Any:
+        if isinstance(given, BaseException):
+            raise given
+        return given
 
-    @property
-    def dist(self) -> SimpleNamespace:
-        return SimpleNamespace(name=self.package)
-
-    @property
-    def value(self) -> str:
-        return f'{self.package}:{self.name}'
-
-    def load(self) -> Any:
-        if isinstance(self.given, BaseException):
-            raise self.given
-        return self.given
+    dist = SimpleNamespace(name=package)
+    return SimpleNamespace(name=name, value=f'{package}:{name}', dist=dist, load=load)
 
 
 @pytest.fixture
-def installed(monkeypatch: pytest.MonkeyPatch) -> dict[str, list[Point]]:
-    points: dict[str, list[Point]] = {tasks.SPECS: [], tasks.SIMULATIONS: []}
+def installed(monkeypatch: pytest.MonkeyPatch) -> dict[str, list[Any]]:
+    points: dict[str, list[Any]] = {tasks.SPECS: [], tasks.SIMULATIONS: []}
 
-    def entry_points(group: str, name: str | None = None) -> list[Point]:
+    def entry_points(group: str, name: str | None = None) -> list[Any]:
         return [each for each in points[group] if name in (None, each.name)]
 
     monkeypatch.setattr(tasks, 'entry_points', entry_points)
@@ -55,11 +45,11 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> dict[str, list[Point]]:
 
 
 def test_a_package_that_exits_at_import_loses_only_its_own_task(
-    installed: dict[str, list[Point]], caplog: pytest.LogCaptureFixture
+    installed: dict[str, list[Any]], caplog: pytest.LogCaptureFixture
 ) -> None:
     installed[tasks.SPECS] += [
-        Point('leaving', 'Left', SystemExit('no such\nrobot')),
-        Point('staying', 'Pushed', PUSH),
+        point('leaving', 'Left', SystemExit('no such\nrobot')),
+        point('staying', 'Pushed', PUSH),
     ]
     with caplog.at_level(logging.WARNING):
         assert list(tasks.third_party_tasks()) == ['Pushed']
@@ -67,18 +57,18 @@ def test_a_package_that_exits_at_import_loses_only_its_own_task(
 
 
 def test_a_task_is_simulated_by_the_package_that_it_is_of(
-    installed: dict[str, list[Point]],
+    installed: dict[str, list[Any]],
 ) -> None:
     installed[tasks.SPECS] += [
-        Point('broken', 'Pushed', ImportError('no such thing')),
-        Point('whole', 'Pushed', PUSH),
-        Point('lonely', 'Alone', replace(PUSH, name='Alone')),
+        point('broken', 'Pushed', ImportError('no such thing')),
+        point('whole', 'Pushed', PUSH),
+        point('lonely', 'Alone', replace(PUSH, name='Alone')),
     ]
     installed[tasks.SIMULATIONS] += [
-        Point('broken', 'Pushed', 'its class'),
-        Point('whole', 'Pushed', 'the class'),
+        point('broken', 'Pushed', 'its class'),
+        point('whole', 'Pushed', 'the class'),
         # Of a task whose specification is a package of its own.
-        Point('elsewhere', 'Alone', 'another class'),
+        point('elsewhere', 'Alone', 'another class'),
     ]
     tasks.third_party_tasks()
     assert tasks.third_party_simulation('Pushed') == 'the class'
@@ -99,21 +89,21 @@ def test_a_task_is_simulated_by_the_package_that_it_is_of(
     ],
 )
 def test_a_specification_that_cannot_be_listed_gives_one_warning(
-    installed: dict[str, list[Point]],
+    installed: dict[str, list[Any]],
     caplog: pytest.LogCaptureFixture,
     name: str,
     given: Any,
     line: str,
 ) -> None:
-    installed[tasks.SPECS].append(Point('wrong', name, given))
+    installed[tasks.SPECS].append(point('wrong', name, given))
     assert tasks.third_party_tasks() == {}
     assert len(caplog.messages) == 1 and line in caplog.text
 
 
 def test_a_copy_of_a_reference_task_has_no_environment_id(
-    installed: dict[str, list[Point]],
+    installed: dict[str, list[Any]],
 ) -> None:
     assert PUSH.reference_id is not None
-    installed[tasks.SPECS].append(Point('own', 'Pushed', PUSH))
+    installed[tasks.SPECS].append(point('own', 'Pushed', PUSH))
     found = tasks.third_party_tasks()
     assert found == {'Pushed': replace(PUSH, reference_id=None)}
