@@ -41,7 +41,7 @@ def test_attributes_and_methods_are_asked_of_some_environments():
 
 
 def seen(step):
-    """What learners read of a step."""
+    """Return the values of a step that learners read."""
     *arrays, infos = step
     names = ('is_success', 'diverged', 'TimeLimit.truncated', 'terminal_observation')
     return arrays, [{name: info[name] for name in names if name in info} for info in infos]
