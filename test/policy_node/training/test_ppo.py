@@ -151,15 +151,15 @@ def learn(cycles: int, **changes: object) -> tuple[PPO, RolloutMaker]:
 
 
 @pytest.mark.parametrize(
-    'changes',
+    ('cycles', 'changes'),
     [
-        {'strategy': 'none'},
-        pytest.param({'importance': 'decision'}, marks=pytest.mark.release),
+        (20, {'strategy': 'none'}),
+        pytest.param(40, {'importance': 'decision'}, marks=pytest.mark.release),
     ],
     ids=['none', 'weighed'],
 )
-def test_ppo_learns_to_follow_the_goal(changes: dict[str, object]) -> None:
-    learner, _ = learn(40, **changes)
+def test_ppo_learns_to_follow_the_goal(cycles: int, changes: dict[str, object]) -> None:
+    learner, _ = learn(cycles, **changes)
     goal = np.linspace(-0.7, 0.7, 15, dtype=np.float32)[:, None]
     actor = learner.evaluation_actor()
     action, _ = actor.predict({'observation': np.zeros_like(goal), 'desired_goal': goal})
