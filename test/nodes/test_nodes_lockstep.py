@@ -5,9 +5,10 @@ from __future__ import annotations
 import signal
 from pathlib import Path
 
+import pytest
 from std_srvs.srv import Trigger
 
-from fetch_hand_sim.episode_log import Episode, read_summary
+from fetch_hand_sim.episode_log import Episode
 from fetch_hand_sim.episodes.checker import check_episode
 from msgs_spec.tasks import task_spec
 from policy_node.training import generate_episodes
@@ -43,13 +44,22 @@ def generated(directory: Path, episodes: int, policy: str, *options: str) -> lis
     return episodes_in(directory)
 
 
-def test_logs_are_equal_between_runs_and_without_ros(start_process: Start, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ('policy', 'disturbances', 'runs'),
+    [('FetchReach', 'hardware*0', 2), ('FetchReach_robust', 'hardware', 1)],
+)
+def test_logs_are_equal_between_runs_without_ros_and_in_their_check(
+    start_process: Start, tmp_path: Path, policy: str, disturbances: str, runs: int
+) -> None:
     # One policy for all of them: what it did before must not matter.
-    policy = start_process(*POLICY_NODE)
-    runs = [logged_run(start_process, tmp_path / name, episodes=2) for name in ('1', '2')]
-    runs.append(generated(tmp_path / 'batch', 2, 'FetchReach'))
-    end(policy)
-    for episodes in zip(*runs, strict=True):
+    node = start_process(*POLICY_NODE, *ros_args(policy=policy.removeprefix('FetchReach_')))
+    logs = [
+        logged_run(start_process, tmp_path / str(run), episodes=2, disturbances=disturbances)
+        for run in range(runs)
+    ]
+    end(node)
+    logs.append(generated(tmp_path / 'batch', 2, policy, f'--disturbances={disturbances}'))
+    for episodes in zip(*logs, strict=True):
         first, *others = episodes
         for episode in others:
             for part in ('topics', 'result', 'attachments'):
@@ -58,66 +68,50 @@ def test_logs_are_equal_between_runs_and_without_ros(start_process: Start, tmp_p
             # A commit may come between the runs.
             same = first.metadata.keys() - {'started', 'source_revision'}
             assert all(episode.metadata[key] == first.metadata[key] for key in same)
-    assert runs[0][0].topics['/joint_states'] != runs[0][1].topics['/joint_states']
+        assert check_episode(first.path).difference is None
+        assert ('action_latency' in first.metadata.get('variation', '')) == (runs == 1)
+    topics = logs[0][0].topics
+    assert topics['/joint_states'] != logs[0][1].topics['/joint_states']
+    if disturbances == 'hardware':
+        measured, true = topics['/joint_states'], topics['/ground_truth/joint_states']
+        assert [m.data for m in measured.messages] != [m.data for m in true.messages]
 
 
-def test_a_disturbed_episode_is_the_same_over_ros_in_the_batch_and_in_its_check(
+def test_resets_leave_a_policy_no_tick_behind_and_disturbances_change_between_episodes(
     start_process: Start, tmp_path: Path
 ) -> None:
-    policy = start_process(*POLICY_NODE, *ros_args(policy='robust'))
-    logged = logged_run(start_process, tmp_path / '1', episodes=2, disturbances='hardware')
-    end(policy)
-    batch = generated(tmp_path / '2', 2, 'FetchReach_robust', '--disturbances=hardware')
-    assert [each.topics for each in logged] == [each.topics for each in batch]
-    topics = logged[0].topics
-    assert [m.data for m in topics['/ground_truth/joint_states'].messages] != [
-        m.data for m in topics['/joint_states'].messages
-    ]
-    for episode in logged:
-        assert check_episode(episode.path).difference is None
-        assert 'action_latency' in episode.metadata['variation']
-
-
-def test_disturbances_change_between_episodes(start_process: Start, tmp_path: Path) -> None:
-    policy = start_process(*POLICY_NODE)
-    arguments = ros_args(mode='lockstep', wait_for_commands=True, episode_dir=tmp_path)
-    sim = start_process(*SIM_NODE, *arguments, '-p', 'log_compiled_model:=false')
-    with client(REACH) as robot:
-        robot.subscribe('reward')
-        robot.spin_until(lambda: robot.received['reward'], 'ticks')
-        for value, is_right in (('severe*2', True), ('sever', False)):
-            result = robot.set_parameter('sim_node', 'disturbances', value)
-            assert result.successful == is_right and ('mild' in result.reason) != is_right
-        count = len(robot.received['reward'])
-        robot.spin_until(lambda: len(robot.received['reward']) > count + 120, 'two episodes')
-    end(sim)
-    end(policy)
-    first, *_, last = sorted(tmp_path.iterdir())
-    assert 'disturbances' not in read_summary(first).metadata
-    assert 'latency' in read_summary(last).metadata['disturbances']
-    assert check_episode(last).difference is None
-
-
-def test_resets_leave_a_policy_no_tick_behind(start_process: Start, tmp_path: Path) -> None:
     """A command on its way at a reset answers the state before it, and is not applied after it."""
     policy = start_process(*POLICY_NODE)
     arguments = ros_args(
-        mode='lockstep', seed=SEED, episodes=60, wait_for_commands=True, episode_dir=tmp_path / '1'
+        mode='lockstep', seed=SEED, episodes=90, wait_for_commands=True, episode_dir=tmp_path / '1'
     )
     sim = start_process(*SIM_NODE, *arguments, '-p', 'log_compiled_model:=false')
     with client(REACH) as robot:
         robot.subscribe('reward')
-        for _ in range(4):
+
+        def run(ticks: int) -> None:
             count = len(robot.received['reward'])
-            robot.spin_until(lambda: len(robot.received['reward']) > count + 70, 'ticks')  # noqa: B023
+            robot.spin_until(lambda: len(robot.received['reward']) > count + ticks, 'ticks')
+
+        for _ in range(4):
+            run(70)
             assert robot.call(Trigger, 'sim_node/reset').success
+        for value, is_right in (('severe*2', True), ('sever', False)):
+            result = robot.set_parameter('sim_node', 'disturbances', value)
+            assert result.successful == is_right and ('mild' in result.reason) != is_right
+        run(120)
         end(sim)
     end(policy)
     episodes = {int(e.metadata['episode']): e for e in episodes_in(tmp_path / '1')}
-    undisturbed = generated(tmp_path / 'batch', max(episodes) + 1, 'FetchReach')
+    disturbed = [number for number, e in episodes.items() if 'disturbances' in e.metadata]
+    last = max(number for number in disturbed if episodes[number].is_complete)
+    assert 'latency' in episodes[last].metadata['disturbances']
+    assert check_episode(episodes[last].path).difference is None
+    assert disturbed == list(range(min(disturbed), max(episodes) + 1))
+    undisturbed = generated(tmp_path / 'batch', min(disturbed), 'FetchReach')
     cut = [number for number, episode in episodes.items() if not episode.is_complete]
     assert len(cut) > 1
-    for number in episodes.keys() - cut:
+    for number in episodes.keys() - {*cut, *disturbed}:
         for name in ('/applied_command', '/reward'):
             first, second = (e[number].topics[name].messages for e in (episodes, undisturbed))
             assert [m.data for m in first] == [m.data for m in second], number

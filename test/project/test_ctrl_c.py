@@ -23,40 +23,34 @@ IMPORT = 'import time:'
 GUARD = 'node_runtime.signals'
 
 
-def interrupt(command: Sequence[str | Path], imports: int, after: str = GUARD) -> tuple[int, str]:
-    """Presses Ctrl-C when so many modules have been loaded after one; returns code and stderr."""
-    process = subprocess.Popen(
-        [sys.executable, '-X', 'importtime', *command],
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-        text=True,
-        env=script_environment(),
-        start_new_session=True,
-    )
-    said, left = [], None
-    for line in process.stderr:
-        if not line.startswith(IMPORT):
-            said.append(line)
-        elif left is None and line.split('|')[-1].strip() == after:
-            left = imports
-        elif left:
-            left -= 1
-            if left == 0:
-                process.send_signal(signal.SIGINT)
-    return process.wait(60), ''.join(said)
+def interrupt(command: Sequence[str | Path], imports: int) -> tuple[int, str]:
+    """Press Ctrl-C when so many modules have been loaded after the handler; return code and stderr.
 
-
-def interrupt_in_time(command: Sequence[str | Path], imports: int) -> tuple[int, str]:
-    """As `interrupt`, of a short command.
-
-    On a busy machine it may be over before the signal reaches it: then again.
+    On a busy machine a short command may be over before the signal reaches it: then again.
     """
     for _ in range(10):
-        answer = interrupt(command, imports)
-        if answer[0] not in (0, 2):
+        process = subprocess.Popen(
+            [sys.executable, '-X', 'importtime', *command],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+            env=script_environment(),
+            start_new_session=True,
+        )
+        said, left = [], None
+        for line in process.stderr:
+            if not line.startswith(IMPORT):
+                said.append(line)
+            elif left is None and line.split('|')[-1].strip() == GUARD:
+                left = imports
+            elif left:
+                left -= 1
+                if left == 0:
+                    process.send_signal(signal.SIGINT)
+        if process.wait(60) not in (0, 2):
             break
-    return answer
+    return process.returncode, ''.join(said)
 
 
 @pytest.fixture(scope='module')
@@ -80,7 +74,7 @@ MODULES = ('fetch_hand_sim', 'fetch_hand_sim.sim_node', 'policy_node.training.tr
 def test_ctrl_c_during_the_import_of_a_program_or_module(started, programs):
     command = started.split() if started.startswith('-m') else [programs / started]
     name = started.rpartition(' ')[2].rpartition('.')[2]
-    assert interrupt_in_time(command, 1) == (130, f'{name}: stopping\n')
+    assert interrupt(command, 1) == (130, f'{name}: stopping\n')
 
 
 @pytest.mark.parametrize(
@@ -93,7 +87,7 @@ def test_ctrl_c_during_the_import_of_a_program_or_module(started, programs):
     ],
 )
 def test_a_command_at_any_moment(name, words, imports, programs):
-    code, said = interrupt_in_time([programs / name, *words], imports)
+    code, said = interrupt([programs / name, *words], imports)
     assert code == 130, said
     assert re.fullmatch(rf'{name}( [a-z]+)*: stopping\n', said)
 
