@@ -63,8 +63,6 @@ def test_wait_ends_in_time_without_anything_to_serve(node):
 
 SUSPENDED = """
 import rclpy
-from rclpy.clock_type import ClockType
-from rclpy.publisher import Publisher
 from std_msgs.msg import Float64
 from node_runtime import event_loop
 event_loop._SUSPENDED = 1.0

@@ -38,14 +38,6 @@ def run(site: Path, *command: object, **options: object) -> subprocess.Completed
     return subprocess.run(words, env=environment(site), capture_output=True, text=True, **options)
 
 
-def install(site: Path, name: str, entry_points: str) -> None:
-    """Writes what pip would write about a package with these entry points."""
-    folder = site / f'{name}-1.dist-info'
-    folder.mkdir()
-    (folder / 'METADATA').write_text(f'Metadata-Version: 2.1\nName: {name}\nVersion: 1\n')
-    (folder / 'entry_points.txt').write_text(entry_points)
-
-
 def test_the_policys_side_reads_it_without_mujoco(site: Path) -> None:
     code = (
         'import sys, policy_node.node\n'
@@ -102,11 +94,13 @@ def test_the_pages_other_reward_trains_and_is_checked(tmp_path: Path) -> None:
     (package / '__init__.py').touch()
     (package / 'specification.py').write_text(specification)
     (package / 'simulation.py').write_text(simulation)
-    install(
-        tmp_path,
-        'near',
+    # As pip writes it.
+    metadata = tmp_path / 'near-1.dist-info'
+    metadata.mkdir()
+    (metadata / 'METADATA').write_text('Metadata-Version: 2.1\nName: near\nVersion: 1\n')
+    (metadata / 'entry_points.txt').write_text(
         '[fetch_hand_sim_tasks.specification]\nFetchPushNear = near.specification:SPECIFICATION\n'
-        '[fetch_hand_sim_tasks.simulation]\nFetchPushNear = near.simulation:FetchPushNear\n',
+        '[fetch_hand_sim_tasks.simulation]\nFetchPushNear = near.simulation:FetchPushNear\n'
     )
     result = run(tmp_path, '-c', ANOTHER_REWARD, cwd=tmp_path)
     assert result.returncode == 0, result.stderr

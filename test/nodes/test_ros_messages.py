@@ -151,9 +151,6 @@ def test_simulation_interfaces_answer_as_their_definitions_say(start_process: St
         features = simulator('get_simulator_features').features
         known = messages.SimulatorFeatures
         assert set(features.features) == {getattr(known, name) for name in services.FEATURES}
-        # The list contains exactly the offered services and actions.
-        assert known.STEP_SIMULATION_ACTION not in features.features
-        assert known.SIMULATION_RESET_TIME not in features.features
         assert list(features.spawn_formats) == []
         assert 'time never goes back' in features.custom_info
         connection.spin_until(lambda: connection.received['joint_states'], 'tick')

@@ -15,6 +15,7 @@ import pytest
 from fetch_hand_sim.__main__ import main
 from fetch_hand_sim.commands.node_processes import executable
 from node_runtime.command_line import EXTRAS
+from node_runtime.signals import EXECUTABLES
 from support import script_environment
 from support.entry_points import console_scripts, leaves, started_as_modules
 
@@ -76,7 +77,7 @@ def test_every_command_is_in_the_table_of_extras():
 
 
 def test_executables_are_the_nodes_view_and_one_for_all_commands():
-    assert set(console_scripts()) == {'fetch_hand_sim', 'view', *NODES.values()}
+    assert set(console_scripts()) == EXECUTABLES == {'fetch_hand_sim', 'view', *NODES.values()}
 
 
 @pytest.mark.parametrize(

@@ -62,10 +62,6 @@ def programs(tmp_path_factory) -> Path:
     return folder
 
 
-def test_the_names_of_executables_are_known():
-    assert frozenset(console_scripts()) == EXECUTABLES
-
-
 # Modules share the code of programs; these import least and most.
 MODULES = ('fetch_hand_sim', 'fetch_hand_sim.sim_node', 'policy_node.training.train_her')
 

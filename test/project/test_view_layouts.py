@@ -33,7 +33,7 @@ def values(tree, key):
     return [each for part in tree for each in values(part, key)] if isinstance(tree, list) else []
 
 
-def test_rviz_shows_topics_of_the_node():
+def test_rviz_shows_topics_of_the_node_and_opens_its_window_without_the_picture():
     layout = yaml.safe_load((ROOT / 'config/view.rviz').read_text())
     shown = {each for each in values(layout, 'Value') if isinstance(each, str)}
     assert shown and shown <= PUBLISHED
@@ -43,11 +43,7 @@ def test_rviz_shows_topics_of_the_node():
     assert layout['Visualization Manager']['Global Options']['Fixed Frame'] == 'world'
     views = layout['Visualization Manager']['Views']
     assert [view['Name'] for view in views['Saved']] == ['Fetch', 'Hand']
-
-
-def test_rviz_opens_its_window_without_the_picture():
-    """rviz2 14.1.5 enables a picture whose window is open, and reads unset memory without docks."""
-    layout = yaml.safe_load((ROOT / 'config/view.rviz').read_text())
+    # rviz2 14.1.5 enables a picture whose window is open, and reads unset memory without docks.
     window = layout['Window Geometry']
     assert window['Hide Left Dock'] is window['Hide Right Dock'] is False
     # A name in UTF-16, its length before it, whether it is shown after it.
@@ -101,17 +97,11 @@ def logged_vectors(task):
 
 def plotjuggler():
     """Plotted curves; functions by name: Lua text, sources."""
-    root = ElementTree.parse(ROOT / 'config/plotjuggler_layout.xml').getroot()
-    functions = {
-        each.get('name'): (
-            each.findtext('function'),
-            [
-                each.findtext('linked_source'),
-                *(v.text for v in each.iterfind('additional_sources/*')),
-            ],
-        )
-        for each in root.iter('snippet')
-    }
+    root, functions = ElementTree.parse(ROOT / 'config/plotjuggler_layout.xml').getroot(), {}
+    for each in root.iter('snippet'):
+        others = [source.text for source in each.iterfind('additional_sources/*')]
+        sources = [each.findtext('linked_source'), *others]
+        functions[each.get('name')] = each.findtext('function'), sources
     return {each.get('name') for each in root.iter('curve')}, functions
 
 
@@ -147,8 +137,7 @@ def test_plotjuggler_shows_curves_of_every_task(task):
         assert found['rotation/HandManipulate'] == pytest.approx(float(rotation))
 
     commands = [part.name for part in task.robot.command]
-    shown = {name: found[name] for name in found if name.partition('/')[2] == 'command'}
-    shown |= {name: found[name] for name in found if name.startswith('command/')}
+    shown = {name: value for name, value in found.items() if 'command' in name.split('/')}
     assert len(shown) == (4 if task.robot.has_gripper_command else 6)
     for name, value in shown.items():
         which = name.replace('command', '').strip('/')

@@ -8,7 +8,6 @@ import pytest
 import torch
 
 from fetch_hand_sim.gym_envs.registration import environment_id
-from support.hindsight import assert_goals_are_exchanged
 from support.same_bits import assert_same
 
 pytest.importorskip('stable_baselines3')
@@ -88,6 +87,18 @@ def test_an_episode_ended_by_a_user_method_has_no_time_limit():
     assert first[2].tolist() == [True, False] and second[2].tolist() == [True, True]
     assert 'terminal_observation' in first[3][0]
     assert [info['TimeLimit.truncated'] for info in second[3]] == [False, True]
+
+
+def assert_goals_are_exchanged(model):
+    """Goals of sampled transitions are others than those pursued, and so are the rewards."""
+    batch = model.replay_buffer.sample(256)
+    goals = batch.observations['desired_goal'].numpy()
+    reached = np.linalg.norm(batch.next_observations['achieved_goal'].numpy() - goals, axis=1)
+    assert len(np.unique(goals, axis=0)) > 3
+    clear = np.abs(reached - 0.05) > 1e-6
+    expected = -(reached > 0.05).astype(np.float32)
+    assert 0.0 in expected
+    assert np.array_equal(batch.rewards.numpy()[clear, 0], expected[clear])
 
 
 def test_it_learns_with_hindsight():

@@ -7,6 +7,8 @@ import signal
 import subprocess
 import sys
 import time
+from array import array
+from dataclasses import fields
 
 import numpy as np
 import pytest
@@ -19,13 +21,12 @@ from fetch_hand_sim.episode_log import EpisodeReadError, EpisodeWriter, read_epi
 from fetch_hand_sim.episode_log.reader import split_ticks
 from fetch_hand_sim.replay_node.schedule import Playhead, ReplaySchedule
 from msgs_spec.codecs import decode, message_stamp
-from msgs_spec.schemas import deserialize, serialize
+from msgs_spec.schemas import deserialize, message_class, serialize
 from msgs_spec.tasks import task_spec
 from msgs_spec.topics import topic, topics
 from node_runtime.ros import ros_message_class
 from support.fresh_actor import fresh_actor
 from support.graph import POLICY_NODE, SIM_NODE, client, finish, ros_args
-from support.ros_messages import from_ros
 
 REPLAY_NODE = (*SIM_NODE[:2], 'fetch_hand_sim.replay_node')
 LISTENER = """
@@ -45,6 +46,25 @@ REACH = task_spec('FetchReach')
 # At half speed, a slow machine may fall 0.8 s behind, ten messages, before one is lost.
 RATE = 0.5
 ODD_NAMES = ('/a b', '/1st', '/a//b', '/' + 300 * 'x')
+
+
+def from_ros(message):
+    """Returns a message of rclpy as an instance of `message_class`, to be given to `serialize`."""
+    package = type(message).__module__.split('.')[0]
+    target = message_class(f'{package}/msg/{type(message).__name__}')
+    names = [item.name for item in fields(target) if item.name != '__msgtype__']
+    return target(**{name: _plain(getattr(message, name)) for name in names})
+
+
+def _plain(value):
+    if hasattr(value, 'get_fields_and_field_types'):
+        return from_ros(value)
+    if isinstance(value, array | np.ndarray):
+        return np.asarray(value)
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    # ROS's `byte` is a bytes object in rclpy and a number in the type store.
+    return value[0] if isinstance(value, bytes) else value
 
 
 def collect(listener, name):

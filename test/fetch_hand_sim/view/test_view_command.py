@@ -58,7 +58,6 @@ def test_a_folder_without_episodes_or_with_one_of_an_unknown_task(capsys, tmp_pa
     [
         (['x', '--task', 'FetchPush'], 'a file and --task exclude', ''),
         (['x', '--robot', 'left'], 'a file and --robot exclude', ''),
-        (['x', '--policy', 'random'], 'a file and --policy exclude', ''),
         (['x', '--episode-dir', 'y', '--task', 'FetchPush'], 'a file and --task and --epi', ''),
         (['--policy', 'x', '--wait', '0'], '--policy: only together with --task', ''),
         (['--episode-dir', 'x', '--wait', '0'], '--episode-dir: only together with --task', ''),
