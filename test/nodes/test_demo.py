@@ -15,6 +15,8 @@ from msgs_spec.tasks import task_spec
 from policy_node.training import generate_episodes
 from support.graph import POLICY_NODE, SIM_NODE, client, finish, ros_args
 
+DEMO = (sys.executable, '-m', 'fetch_hand_sim', 'demo', '--policy', 'resting')
+
 
 @pytest.mark.parametrize(
     ('number', 'code'),
@@ -27,12 +29,11 @@ from support.graph import POLICY_NODE, SIM_NODE, client, finish, ros_args
 def test_the_demo_logs_episodes_and_stops_in_order(
     number, code, start_process, ros_environment, tmp_path
 ):
-    command = [sys.executable, '-m', 'fetch_hand_sim', 'demo', '--policy', 'resting']
     # Which a parameter file would have as a number and a comment.
     directory = '20261125 #1'
     options = ('--episodes', '100', f'--episode-dir=~/{directory}')
     environment = ros_environment | {'HOME': str(tmp_path)}
-    demo = start_process(*command, *options, env=environment)
+    demo = start_process(*DEMO, *options, env=environment)
     header = 'episode seed steps return success file'
     assert demo.stdout.readline().split() == header.split()
     row = demo.stdout.readline().split()
@@ -55,8 +56,7 @@ def test_the_demo_counts_no_episodes_of_others_in_its_directory(
     options = ['--policy', 'resting', '--task', 'FetchReach', '--episodes=1', '--first-seed=7']
     assert generate_episodes.main([*options, '--output', str(elsewhere)]) == 0
     (other,) = elsewhere.iterdir()
-    command = [sys.executable, '-m', 'fetch_hand_sim', 'demo', '--policy', 'resting']
-    demo = start_process(*command, '--episodes', '1', '--episode-dir', tmp_path)
+    demo = start_process(*DEMO, '--episodes', '1', '--episode-dir', tmp_path)
     assert demo.stdout.readline().startswith('episode')
     other.rename(tmp_path / other.name)
     code, output = finish(demo)
@@ -80,8 +80,7 @@ def test_the_demo_is_not_begun_beside_others(node, who, start_process, tmp_path)
         names = connection.node.get_node_names
         others = {'sim_node', 'actor'}
         connection.spin_until(lambda: others & set(names()), 'the other')
-    command = (sys.executable, '-m', 'fetch_hand_sim', 'demo', '--policy', 'resting')
-    code, output = finish(start_process(*command, '--episodes', '1', cwd=tmp_path), timeout=60.0)
+    code, output = finish(start_process(*DEMO, '--episodes', '1', cwd=tmp_path), timeout=60.0)
     assert code == 1
     assert output == (
         f'fetch_hand_sim demo: {who} is running in / and would interact with this demo: stop it, '

@@ -23,7 +23,7 @@ from support.graph import (
     client,
     end,
     episodes_in,
-    finish,
+    logged_run,
     payload,
     ros_args,
 )
@@ -102,12 +102,7 @@ def test_with_answer_wait_real_time_equals_lockstep(start_process: Start, tmp_pa
 
     def played(name: str, **parameters: object) -> tuple[list[object], list[int | None]]:
         """Return the published messages of two episodes, and their late commands."""
-        arguments = ros_args(
-            wait_for_commands=True, episodes=2, seed=5, episode_dir=tmp_path / name, **parameters
-        )
-        code, output = finish(start_process(*SIM_NODE, *arguments), timeout=120.0)
-        assert code == 0, output
-        episodes = episodes_in(tmp_path / name)
+        episodes = logged_run(start_process, tmp_path / name, episodes=2, seed=5, **parameters)
         assert [each.result['success'] for each in episodes] == ['true', 'true']
         assert all(len(each.metadata['checkpoint_sha256']) == 64 for each in episodes)
         # The answer to the last tick of an episode may come in the next one, where it is late.
@@ -116,10 +111,12 @@ def test_with_answer_wait_real_time_equals_lockstep(start_process: Start, tmp_pa
             del each['/commands']
         return list(messages), [each.outcome.late_commands for each in episodes]
 
-    expected, late = played('lockstep', mode='lockstep')
+    expected, late = played('lockstep')
     assert late == [None, None]
     for attempt in range(3):
-        paced, late = played(str(attempt), real_time_factor=20.0, answer_wait=1000.0)
+        paced, late = played(
+            str(attempt), mode='realtime', real_time_factor=20.0, answer_wait=1000.0
+        )
         # A very busy machine may stop a policy for a second.
         if late == [0, 0]:
             break

@@ -19,7 +19,7 @@ from support.graph import (
     client,
     end,
     episodes_in,
-    finish,
+    logged_run,
     ros_args,
 )
 
@@ -27,17 +27,8 @@ REACH = task_spec('FetchReach')
 SEED = 7
 
 
-def logged_run(start: Start, directory: Path, **parameters: object) -> list[Episode]:
-    """The episodes of one run of a robot."""
-    settings = {'mode': 'lockstep', 'wait_for_commands': True, 'log_compiled_model': False}
-    arguments = ros_args(seed=SEED, episode_dir=directory, **settings, **parameters)
-    code, output = finish(start(*SIM_NODE, *arguments), timeout=60.0)
-    assert code == 0, output
-    return episodes_in(directory)
-
-
 def generated(directory: Path, episodes: int, policy: str, *options: str) -> list[Episode]:
-    """The same without ROS."""
+    """Run episodes without ROS."""
     arguments = ['--task', 'FetchReach', '--policy', policy, '--num-envs=1', '--threads=1']
     numbers = [f'--episodes={episodes}', f'--first-seed={SEED}', f'--output={directory}']
     assert generate_episodes.main([*arguments, *numbers, *options]) == 0
@@ -53,10 +44,9 @@ def test_logs_are_equal_between_runs_without_ros_and_in_their_check(
 ) -> None:
     # One policy for all of them: what it did before must not matter.
     node = start_process(*POLICY_NODE, *ros_args(policy=policy.removeprefix('FetchReach_')))
-    logs = [
-        logged_run(start_process, tmp_path / str(run), episodes=2, disturbances=disturbances)
-        for run in range(runs)
-    ]
+    settings = {'disturbances': disturbances, 'log_compiled_model': False, 'seed': SEED}
+    folders = [tmp_path / str(run) for run in range(runs)]
+    logs = [logged_run(start_process, folder, episodes=2, **settings) for folder in folders]
     end(node)
     logs.append(generated(tmp_path / 'batch', 2, policy, f'--disturbances={disturbances}'))
     for episodes in zip(*logs, strict=True):

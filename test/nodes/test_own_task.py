@@ -5,12 +5,13 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import pytest
 
 from support import ROOT
-from support.graph import POLICY_NODE, SIM_NODE, Start, end, episodes_in, finish, ros_args
+from support.graph import POLICY_NODE, Start, end, finish, logged_run, ros_args
 from support.shell_lines import commands, python_blocks, shell_lines
 
 EXAMPLE = ROOT / 'examples' / 'fetch_reach_oriented'
@@ -158,7 +159,8 @@ def test_gymnasium_the_batch_a_controller_of_three_lines_and_pictures(site: Path
 def test_it_is_trained_run_by_the_nodes_logged_checked_and_replayed(
     site: Path, start_process: Start, tmp_path: Path, ros_environment: dict[str, str]
 ) -> None:
-    os_environment = ros_environment | {'PYTHONPATH': environment(site)['PYTHONPATH']}
+    node_environment = ros_environment | {'PYTHONPATH': environment(site)['PYTHONPATH']}
+    start = partial(start_process, env=node_environment)
     few = ['--steps', '800', '--num-envs', '4', '--torch-threads', '1', '--threads', '1']
     brief = ['updates_per_cycle=2', 'evaluation_episodes=4', 'moved_share=0', 'batch_size=32']
     settings = [word for each in brief for word in ('--set', each)]
@@ -172,22 +174,13 @@ def test_it_is_trained_run_by_the_nodes_logged_checked_and_replayed(
     assert trained.returncode == 0, trained.stderr
     actor = tmp_path / 'run' / 'latest.safetensors'
 
-    policy = start_process(*POLICY_NODE, *ros_args(checkpoint=actor), env=os_environment)
-    arguments = ros_args(
-        task=TASK,
-        mode='lockstep',
-        episodes=1,
-        wait_for_commands=True,
-        episode_dir=tmp_path / 'episodes',
-    )
-    code, output = finish(start_process(*SIM_NODE, *arguments, env=os_environment), timeout=60.0)
-    assert code == 0, output
+    policy = start(*POLICY_NODE, *ros_args(checkpoint=actor))
+    (episode,) = logged_run(start, tmp_path / 'episodes', task=TASK, episodes=1)
     checked = run(site, '-m', 'fetch_hand_sim', 'episodes', 'check', tmp_path / 'episodes')
     assert checked.returncode == 0, checked.stdout + checked.stderr
 
-    (episode,) = episodes_in(tmp_path / 'episodes')
     replay = (sys.executable, '-m', 'fetch_hand_sim.replay_node')
     arguments = ros_args(path=episode.path, rate=10.0, wait_for_commands=True)
-    code, output = finish(start_process(*replay, *arguments, env=os_environment), timeout=60.0)
+    code, output = finish(start(*replay, *arguments), timeout=60.0)
     assert code == 0, output
     end(policy)

@@ -24,8 +24,8 @@ from support.graph import (
     Start,
     client,
     end,
-    episodes_in,
     finish,
+    logged_run,
     ros_args,
 )
 from support.random_ticks import episode_status
@@ -61,11 +61,7 @@ def test_a_robot_that_comes_back_with_another_task_gets_its_own_actor(
     """Also once such an actor has been set while no robot was there."""
     policy = start_process(*POLICY_NODE)
     for task in ('FetchReach', 'HandReach', 'FetchReach'):
-        arguments = ros_args(
-            task=task, episodes=1, mode='lockstep', wait_for_commands=True, episode_dir=tmp_path
-        )
-        code, output = finish(start_process(*SIM_NODE, *arguments))
-        assert code == 0, output
+        logged = logged_run(start_process, tmp_path, task=task, episodes=1)
     with client(REACH) as robot:
         status = topic(REACH, 'episode_status').name
         robot.spin_until(lambda: not robot.node.count_publishers(status), 'no robot')
@@ -76,7 +72,6 @@ def test_a_robot_that_comes_back_with_another_task_gets_its_own_actor(
     output = end(policy)
     assert 'the robot changed from FetchReach at 25 Hz to HandReach at 25 Hz' in output
     assert 'HandReach: commands come from actor HandReach.safetensors' in output
-    logged = episodes_in(tmp_path)
     assert sorted(e.metadata['task'] for e in logged) == ['FetchReach', 'FetchReach', 'HandReach']
     assert len({e.metadata['checkpoint_sha256'] for e in logged}) == 2
 
@@ -164,13 +159,13 @@ def test_robot_and_policy_in_different_namespaces_name_each_other(start_process:
     end(sim)
 
 
-def test_a_robot_whose_topics_have_other_names_is_found(start_process: Start) -> None:
-    arguments = ros_args(episodes=1, mode='lockstep', wait_for_commands=True)
+def test_a_robot_whose_topics_have_other_names_is_found(
+    start_process: Start, tmp_path: Path
+) -> None:
     names = ['joint_states:=/arm/joints', 'commands:=/arm/goals', 'policy_status:=/arm/policy']
     remapped = [word for name in names for word in ('-r', name)]
     policy = start_process(*POLICY_NODE, '--ros-args', *remapped)
-    code, output = finish(start_process(*SIM_NODE, *arguments, *remapped))
-    assert code == 0, output
+    assert logged_run(start_process, tmp_path, *remapped, episodes=1)
     end(policy)
 
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import re
 import signal
-import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable
@@ -12,6 +10,7 @@ from contextlib import AbstractContextManager, contextmanager
 from importlib.util import find_spec
 from io import BytesIO
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import numpy as np
 import PIL.Image
@@ -41,19 +40,20 @@ from support.episode_recorder import Recorder
 from support.graph import (
     POLICY_NODE,
     SIM_NODE,
+    VIEW,
     Client,
     Start,
     client,
     end,
     episodes_in,
-    finish,
+    logged_run,
+    open_view,
     payload,
     ros_args,
 )
 from support.visitors import DeafVisitor, Visitor
 
 REACH = task_spec('FetchReach')
-VIEW = (sys.executable, '-m', 'fetch_hand_sim.view', '--no-browser')
 VIEW_REPLAY = (sys.executable, '-m', 'fetch_hand_sim.replay_node')
 VISUALIZATION = (sys.executable, '-m', 'fetch_hand_sim.visualization_node')
 TOPIC = 'achieved_goal'
@@ -242,14 +242,6 @@ def test_a_replay_of_any_name_is_told_from_a_robot_and_paused(
         follower.until(lambda p: not p.facts.is_paused and p.stamp_ns != stamp, 'it goes on')
 
 
-def open_view(start_process: Start) -> tuple[subprocess.Popen[str], str]:
-    """Starts a viewer; returns its process and where its page is."""
-    view = start_process(*VIEW, '--wait', '30')
-    found = re.search(r'http://(127.0.0.1:\d+)/', view.stdout.readline())
-    assert found, view.communicate()
-    return view, found[1]
-
-
 def wait_for_pictures(connection: Client, visitor: Visitor) -> None:
     """Waits until a visitor has seen more than it had."""
     wanted = visitor.pictures + 5
@@ -318,12 +310,12 @@ def test_a_page_or_a_viewer_that_ends_or_hangs_is_not_noticed(
 
         @contextmanager
         def harmed():
-            view, address = open_view(start_process)
+            view, url, _ = open_view(start_process, '--wait', '30')
             assert set(niceness_of_threads(view.pid)) == {10}
-            visitor = Visitor(address, 'visitor')
+            visitor = Visitor(urlsplit(url).netloc, 'visitor')
             wait_for_pictures(connection, visitor)
             if harm == 'visitor is deaf':
-                with DeafVisitor(address):
+                with DeafVisitor(urlsplit(url).netloc):
                     yield
                     # Nor do those who watch beside it.
                     wait_for_pictures(connection, visitor)
@@ -347,19 +339,14 @@ def test_episodes_are_logged_to_the_same_bytes_with_and_without_viewers(
 ) -> None:
     """A page with its visitor, markers, scalars and pictures leave no trace in them."""
 
-    def start_robot(name: str, episodes: int) -> subprocess.Popen[str]:
-        settings = {'seed': 7, 'episodes': episodes, 'episode_dir': tmp_path / name}
-        lockstep = ros_args(mode='lockstep', wait_for_commands=True, **settings)
-        return start_process(*SIM_NODE, *lockstep)
-
-    robot, policy = start_robot('alone', 4), start_process(*POLICY_NODE)
-    code, output = finish(robot, 60.0)
-    assert code == 0, output
+    policy = start_process(*POLICY_NODE)
+    logged_run(start_process, tmp_path / 'alone', seed=7, episodes=4)
     end(policy)
-    robot = start_robot('watched', 0)
+    settings = {'mode': 'lockstep', 'seed': 7, 'episode_dir': tmp_path / 'watched'}
+    robot = start_process(*SIM_NODE, *ros_args(wait_for_commands=True, **settings))
     node = start_process(*VISUALIZATION, *ros_args(camera_width=64, camera_height=48))
-    view, address = open_view(start_process)
-    visitor = Visitor(address, 'visitor')
+    view, url, _ = open_view(start_process, '--wait', '30')
+    visitor = Visitor(urlsplit(url).netloc, 'visitor')
     names = ['goal_markers', 'scalars/distance', *(['camera/image_raw'] if can_render() else [])]
     with client(REACH) as connection:
         connection.subscribe('episode_status', *names)

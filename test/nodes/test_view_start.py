@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import signal
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -12,31 +10,20 @@ from diagnostic_msgs.msg import DiagnosticStatus
 
 from msgs_spec.tasks import task_spec
 from support import is_running, running_processes, stat_of, wait_until
-from support.graph import SIM_NODE, Start, client, finish, ros_args
+from support.graph import SIM_NODE, VIEW, Start, client, finish, open_view, ros_args
 
 REACH = task_spec('FetchReach')
-VIEW = (sys.executable, '-m', 'fetch_hand_sim.view', '--no-browser')
 
 
 def children_of(parent: int) -> list[int]:
     return [each for each in running_processes() if stat_of(each)[1:2] == [str(parent)]]
 
 
-def start_view(start_process: Start, *arguments: str) -> tuple[subprocess.Popen[str], list[str]]:
-    """Start a page; return its process and its output until the page is served."""
-    view = start_process(*VIEW, *arguments)
-    said = []
-    while not said or 'The page is at' not in said[-1]:
-        said.append(view.stdout.readline())
-        assert said[-1], finish(view)
-    return view, said
-
-
 @pytest.mark.parametrize(('number', 'is_loaded'), [(signal.SIGKILL, False), (signal.SIGHUP, True)])
 def test_the_nodes_end_with_their_parent(
     start_process: Start, number: signal.Signals, is_loaded: bool
 ) -> None:
-    view, _ = start_view(start_process, '--task', 'FetchReach')
+    view, *_ = open_view(start_process, '--task', 'FetchReach')
     nodes = children_of(view.pid)
     assert len(nodes) == 2
     if is_loaded:
@@ -77,7 +64,7 @@ def test_of_two_robots_in_their_namespaces_one_publishes_the_clock(start_process
         ('left', 'FetchReach', ('--ros-args', '-r', '__ns:=/left')),
         ('right', 'HandReach', ('--robot', 'right')),
     ):
-        _, said = start_view(start_process, '--task', task, *namespace)
+        *_, said = open_view(start_process, '--task', task, *namespace)
         assert any('/clock comes from another' in line for line in said) == (robot == 'right')
         with client(REACH) as connection:
             connection.subscribe('/diagnostics')

@@ -9,7 +9,7 @@ import sys
 import pytest
 
 from support import ROOT
-from support.graph import SIM_NODE, episodes_in, finish, ros_args
+from support.graph import logged_run
 
 PAGE = ROOT / 'docs' / 'tutorials' / 'write_your_own_controller.md'
 
@@ -38,11 +38,7 @@ def test_the_controller_is_short_and_imports_only_ros(controller):
 @pytest.mark.parametrize('mode', ['realtime', pytest.param('lockstep', marks=pytest.mark.release)])
 def test_it_drives_the_arm_to_its_goals(controller, start_process, tmp_path, mode):
     start_process(sys.executable, controller, cwd=tmp_path)
-    arguments = ros_args(
-        mode=mode, episodes=2, real_time_factor=2.0, wait_for_commands=True, episode_dir='episodes'
-    )
-    code, output = finish(start_process(*SIM_NODE, *arguments, cwd=tmp_path), timeout=60.0)
-    assert code == 0, output
-    logged = episodes_in(tmp_path / 'episodes')
+    settings = {'mode': mode, 'episodes': 2, 'real_time_factor': 2.0}
+    logged = logged_run(start_process, tmp_path / 'episodes', **settings)
     assert [episode.result['success'] for episode in logged] == ['true', 'true']
     assert all(episode.is_complete for episode in logged)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import signal
 import subprocess
 import sys
@@ -30,6 +31,7 @@ from node_runtime.ros import open_publisher, subscribe
 
 SIM_NODE = (sys.executable, '-m', 'fetch_hand_sim.sim_node')
 POLICY_NODE = (sys.executable, '-m', 'policy_node.node')
+VIEW = (sys.executable, '-m', 'fetch_hand_sim.view', '--no-browser')
 TIMEOUT = 30.0
 Start = Callable[..., subprocess.Popen[str]]
 
@@ -61,6 +63,27 @@ def end(process: subprocess.Popen[str]) -> str:
 def episodes_in(directory: Path) -> list[Episode]:
     """The finished episodes of a directory, in order."""
     return [read_episode(path) for path in sorted(directory.iterdir()) if path.name[0] != '.']
+
+
+def logged_run(
+    start: Start, directory: Path, *words: object, **parameters: object
+) -> list[Episode]:
+    """Run a robot that waits for commands, in lockstep by default; return its episodes."""
+    settings = {'mode': 'lockstep', 'wait_for_commands': True, 'episode_dir': directory}
+    robot = start(*SIM_NODE, *ros_args(**settings | parameters), *words)
+    code, output = finish(robot, timeout=120.0)
+    assert code == 0, output
+    return episodes_in(directory)
+
+
+def open_view(start: Start, *arguments: object) -> tuple[subprocess.Popen[str], str, list[str]]:
+    """Start a page; return its process, its address and its output up to the address."""
+    view = start(*VIEW, *arguments)
+    said = []
+    while not said or 'The page is at' not in said[-1]:
+        said.append(view.stdout.readline())
+        assert said[-1], finish(view)
+    return view, re.findall(r'http://\S+', said[-1])[0], said
 
 
 def payload(episode: Episode) -> dict[str, list[tuple[int, int, bytes]]]:

@@ -26,7 +26,7 @@ from msgs_spec.tasks import task_spec
 from msgs_spec.topics import topic, topics
 from node_runtime.ros import ros_message_class
 from support.fresh_actor import fresh_actor
-from support.graph import POLICY_NODE, SIM_NODE, client, finish, ros_args
+from support.graph import POLICY_NODE, SIM_NODE, client, finish, logged_run, ros_args
 
 REPLAY_NODE = (*SIM_NODE[:2], 'fetch_hand_sim.replay_node')
 LISTENER = """
@@ -80,20 +80,11 @@ def collect(listener, name):
 def record(start_process, directory, task, actor):
     """One episode of real nodes in lockstep, so that every tick has its command."""
     policy = start_process(*POLICY_NODE, *ros_args(policy=actor))
-    arguments = ros_args(
-        task=task,
-        episodes=1,
-        seed=3,
-        mode='lockstep',
-        wait_for_commands=True,
-        log_compiled_model=False,
-        episode_dir=directory,
-    )
-    code, output = finish(start_process(*SIM_NODE, *arguments))
-    assert code == 0, output
+    settings = {'task': task, 'episodes': 1, 'seed': 3, 'log_compiled_model': False}
+    (episode,) = logged_run(start_process, directory, **settings)
     policy.send_signal(signal.SIGTERM)
     assert finish(policy)[0] == 0
-    return min(directory.iterdir())
+    return episode.path
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import socket
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -18,7 +19,8 @@ from fetch_hand_sim.view.live import LiveRobot
 from fetch_hand_sim.view.requests import ReleaseGoal, SetCommand, SetCommanding, SetGoal
 from fetch_hand_sim.view.robot_requests import RemoteNode
 from fetch_hand_sim.view.robot_watch import SeenTick
-from msgs_spec.tick import EpisodeStatus
+from msgs_spec.tasks import task_spec
+from support.random_ticks import episode_status
 
 
 def test_a_silent_visitor_is_absent_and_a_departed_one_is_noticed_once():
@@ -77,9 +79,8 @@ def robot(node):
 
 def follow(robot, stamps=(), **changes):
     """Show a status and ticks with these stamps to a page."""
-    fields = {'task': 'FetchReach', 'episode': 0, 'seed': 0, 'tick': 0, 'phase': 'reset'}
-    fields |= {'control_hz': 25.0, 'reward_type': 'sparse', 'success_rule': 'gymnasium'}
-    status = EpisodeStatus(**fields | {'episode_return': 0.0, 'is_success': False} | changes)
+    changes = {'episode': 0, 'tick': 0, 'phase': 'reset', 'control_hz': 25.0} | changes
+    status = replace(episode_status(task_spec('FetchReach')), **changes)
     robot._watch.status = status
     robot._on_status(status)
     for stamp in stamps:
