@@ -320,7 +320,8 @@ def test_numbers_go_on_after_what_is_there(tmp_path, task):
     writers = [each.begin(task, 5, {}) for each in (*directories, *directories)]
     for number, writer in enumerate(writers, start=7):
         assert files.active_path(tmp_path, f'{task}_{number:06d}_seed5').is_dir()
-        assert writer.finish({}) is None
+        assert writer.finish({}, 'no messages') is None
+    assert not list(tmp_path.glob('.*_seed5.active'))
 
 
 def test_quality_of_service_is_written_as_rosbag2_version_9():

@@ -379,9 +379,12 @@ def test_film_episode_plays_to_the_end_with_a_policy_or_a_function(opengl):
 
     film = film_episode(env, Resting(), seed=3)
     assert (len(film), film.fps) == (51, 25)
-    same = film_episode(env, lambda observation: rests, seed=3)
-    assert all((a == b).all() for a, b in zip(film, same, strict=True))
-    assert not all((a == b).all() for a, b in zip(film, film_episode(env, Resting()), strict=True))
+    # Drawing takes long: the others end early.
+    short = TimeLimit(env, 5)
+    same = film_episode(short, lambda observation: rests, seed=3)
+    assert len(same) == 6 and all((a == b).all() for a, b in zip(same, film, strict=False))
+    other = film_episode(short, Resting())
+    assert not all((a == b).all() for a, b in zip(other, film, strict=False))
     with pytest.raises(ValueError, match=re.escape("render_mode None; allowed: 'rgb_array'")):
         film_episode(fetch_hand_sim.make('FetchReach'), Resting())
     with pytest.raises(ValueError, match="policy 'FetchReach'; allowed: what has predict"):
