@@ -154,11 +154,8 @@ def test_every_message_comes_back_as_recorded_with_its_timing(start_process, fin
     assert np.median(np.diff(times)) == pytest.approx(0.04, abs=0.004)
 
 
-def test_late_subscribers_get_the_latched_topics_of_an_offset_until_it_is_interrupted(
-    start_process, finished
-):
-    arguments = ros_args(path=finished, start_offset=1.0, start_paused=True)
-    replay = start_process(*REPLAY_NODE, *arguments)
+def test_late_subscribers_get_the_latched_topics_of_an_offset(start_process, finished):
+    start_process(*REPLAY_NODE, *ros_args(path=finished, start_offset=1.0, start_paused=True))
     with client(REACH) as listener:
         listener.subscribe('desired_goal', 'episode_status', 'joint_states')
         listener.spin_until(lambda: bool(listener.received['desired_goal']), 'the latched goal')
@@ -170,9 +167,6 @@ def test_late_subscribers_get_the_latched_topics_of_an_offset_until_it_is_interr
         listener.call(SetBool, 'replay_node/pause', data=False)
         listener.spin_until(lambda: bool(listener.received['joint_states']), 'a tick')
         assert message_stamp(listener.received['joint_states'][0]) == 2_000_000_000
-        listener.call(SetBool, 'replay_node/pause', data=True)
-    replay.send_signal(signal.SIGINT)
-    assert_ends_well(replay, '; paused until ~/pause is called with false')
 
 
 @pytest.mark.alone
@@ -226,6 +220,15 @@ def assert_ends_well(replay, said=''):
     code, output = finish(replay)
     assert (code, output.count('\n')) == (0, 1), output
     assert 'real time; topics in /' in output and output.endswith(f'{said}\n')
+
+
+def test_a_replay_that_waits_for_commands_is_interrupted(start_process, finished):
+    replay = start_process(*REPLAY_NODE, *ros_args(path=finished, wait_for_commands=True))
+    with client(REACH) as listener:
+        listener.subscribe('episode_status')
+        listener.spin_until(lambda: bool(listener.received['episode_status']), 'latched status')
+    replay.send_signal(signal.SIGINT)
+    assert_ends_well(replay, '; topics in /; waits for commands')
 
 
 @pytest.mark.alone
