@@ -223,7 +223,8 @@ def test_check_episode_codes(reach, tmp_path, capsys):
 
 def test_loaded_observations_equal_those_of_the_simulation(generated):
     task, paths = generated
-    for arrays in load_episodes(paths[0].parent):
+    # The second robot of the first batch, and the only one of the second batch.
+    for arrays in load_episodes(paths[0].parent)[1::2]:
         spec, steps = arrays.spec, TASKS[task].episode_ticks
         simulation = Simulation(task, num_threads=1)
         observation = simulation.reset(seed=int(arrays.metadata['seed']))
