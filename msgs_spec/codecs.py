@@ -351,7 +351,7 @@ class TopicCodec:
         return stamps, np.take(floats, self._slots, axis=1).astype(np.float64, copy=False)
 
     def _fixed_runs(self) -> list[slice]:
-        """Run of bytes that are the same in all messages."""
+        """Return the ranges of bytes that are the same in all messages."""
         varying = [(_BODY + _FLOAT.size * int(slot), _FLOAT.size) for slot in self._slots]
         if self._has_stamp:
             varying.append((_BODY, _STAMP.size))

@@ -35,7 +35,7 @@ PHASES: dict[Phase, str] = {
     'finished': 'at the last tick of an episode that no reset ended',
 }
 
-# Values that the message leaves out.
+# Values with which a key is left out of the message.
 _LEFT_OUT = {'joint_prefix': JOINT_PREFIX, 'disturbances': '', 'variation': ''}
 
 _CHOICES: dict[str, tuple[str, ...]] = {

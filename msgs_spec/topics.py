@@ -28,7 +28,10 @@ COMMAND = QosSpec(depth=10, reliability='reliable', durability='volatile')
 CLOCK = QosSpec(depth=1, reliability='reliable', durability='volatile')
 
 
-# Tasks to remember. Publishers choose the names of joints, so the number of tasks is unlimited.
+# Meaning of the messages of an episode. In version 1, which recorded no number, a robot ignored
+# frame and stamp of a goal, and the orientations of `fingertip_poses` were identity.
+INTERFACE_VERSION = 2
+# Size of the cache of topics. Each joint prefix makes another task, so a limit is needed.
 _TASKS = 256
 WORLD = 'world'
 
@@ -63,6 +66,7 @@ class TopicSpec:
         frame: `header.frame_id`, or empty.
         names: Joint names in the message.
         direction: Seen from `sim_node`.
+        since: First `INTERFACE_VERSION` whose episode files contain the topic.
     """
 
     name: str
@@ -73,6 +77,7 @@ class TopicSpec:
     names: tuple[str, ...] = ()
     qos: QosSpec = STATE
     direction: Literal['published', 'subscribed'] = 'published'
+    since: int = 1
 
     @property
     def size(self) -> int:
@@ -116,7 +121,13 @@ def _body_topics(task: TaskSpec) -> list[TopicSpec]:
     if task.robot.has_gripper_command:
         specs = [
             TopicSpec('end_effector_pose', pose, 'Site between the fingers.', _POSE, frame=WORLD),
-            TopicSpec('end_effector_twist', twist, 'The same site.', _TWIST, frame=WORLD),
+            TopicSpec(
+                'end_effector_twist',
+                twist,
+                'Velocity of the site between the fingers.',
+                _TWIST,
+                frame=WORLD,
+            ),
         ]
     else:
         text = 'Sites at the fingertips, oriented as the distal segments.'
@@ -199,7 +210,7 @@ def _command_topics(task: TaskSpec) -> list[TopicSpec]:
     return specs
 
 
-# In wall time: no part of a tick and never logged.
+# Published once per second of wall time, not at every tick, and never logged.
 DIAGNOSTICS = TopicSpec(
     '/diagnostics',
     'diagnostic_msgs/msg/DiagnosticArray',
@@ -253,8 +264,9 @@ def relative_name(resolved: str) -> str:
 def topics(task: TaskSpec) -> tuple[TopicSpec, ...]:
     """Return all topics of a task.
 
-    The order is part of the contract: first the published topics in the order of a tick, then the
-    subscribed ones.
+    The order is part of the contract: first the published topics in the order of a tick, of which
+    `applied_command` is the last, then the subscribed ones. A new published topic also needs its
+    value in `tick.TickEncoder.encode`, and a new `INTERFACE_VERSION`, which is its `since`.
     """
     clock = TopicSpec(
         '/clock', 'rosgraph_msgs/msg/Clock', 'Simulated time, once per tick.', qos=CLOCK

@@ -32,6 +32,7 @@ from msgs_spec.tasks import (
     task_spec,
 )
 from msgs_spec.text import one_of
+from msgs_spec.topics import INTERFACE_VERSION
 
 Strings = Mapping[str, str]
 Number = TypeVar('Number', int, float)
@@ -51,7 +52,7 @@ class EpisodeRecord:
         task: The task, with the joint names of its messages, `episode_ticks` at 25 Hz.
         episode: Number of the episode in its run, from 0.
         control_hz: Ticks per simulated second.
-        interface_version: Meaning of the messages, see `INTERFACE_VERSION`.
+        interface_version: Meaning of the messages, see `msgs_spec.topics.INTERFACE_VERSION`.
         perturb_limit: Largest force of a push, N; 0 if pushes were off.
         timing: Quantities kept at rates other than 25 Hz, see `msgs_spec.tasks.Timing`.
     """
@@ -234,10 +235,6 @@ def _number_or_none(text: str, kind: type[Number]) -> Number | None:
 # Writing
 
 
-# Meaning of the messages of an episode. In version 1, which recorded no number, a robot ignored
-# frame and stamp of a goal, and the orientations of `fingertip_poses` were identity.
-INTERFACE_VERSION = 2
-
 _PACKAGES = ('fetch_hand_sim', 'mujoco', 'numpy', 'gymnasium-robotics', 'mcap')
 
 
@@ -271,8 +268,8 @@ def episode_metadata(
 
     Args:
         episode: Number of the episode in this run, from 0; file names count over all runs.
-        timing: Recorded only as `seconds` at another rate than 25 Hz; files without it mean
-            `ticks`, because robots up to 1.0 recorded nothing.
+        timing: Unit of step counts, recorded only if it is `seconds` and the rate is not 25 Hz.
+            Files without it mean `ticks`, as those of version 1.0.
         joint_prefix: Recorded only if it is not the usual one.
         model_sha256: Fingerprint of the compiled model, see `model_sha256`.
         perturb_limit: Largest force of a push, N; recorded only if pushes are on.

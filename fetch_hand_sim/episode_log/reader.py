@@ -157,7 +157,8 @@ def read_episode(path: Path | str) -> Episode:
             metadata=records[EPISODE],
             result=records[EPISODE_RESULT],
             message_count=len(times),
-            duration_s=(int(times[-1]) - int(times[0])) / 1e9 if len(times) else 0.0,
+            # Log times also contain the rank of a message in its tick, ns.
+            duration_s=round((int(times[-1]) - int(times[0])) / 1e9, 6) if len(times) else 0.0,
             size_bytes=len(data),
             attachments={each.name: each.data for each in contents.attachments},
             schemas=contents.schemas,

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
-from itertools import chain
+from itertools import chain, zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -223,7 +223,7 @@ def _differences(
                 raise ValueError(f'no applied_command at tick {number}')
             result.unchecked = len(logged.published)
             if episode.is_complete:
-                yield differs('topics', 'no applied_command', 'applied_command')
+                yield differs('topic', 'no applied_command', 'applied_command')
             return
         if number and runner.is_between_episodes:
             yield differs('length', f'{len(ticks)} ticks', f'{number} ticks')
@@ -233,7 +233,8 @@ def _differences(
             yield differs('metadata variation', drawn, tick.status.variation)
         tick = _as_of(record.interface_version, tick)
         has_status = logged.find('episode_status') is not None
-        expected = encoder.encode(tick, latched=has_status or tick.status.phase != 'running')
+        encoded = encoder.encode(tick, latched=has_status or tick.status.phase != 'running')
+        expected = [each for each in encoded if each[0].since <= record.interface_version]
         if logged is ticks[-1] and not runner.is_between_episodes:
             expected = expected[: len(logged.published)]
         # Recovery may leave out received messages.
@@ -257,7 +258,10 @@ def _require_goals(episode: Episode) -> None:
 
 
 def _as_of(interface_version: int, tick: Tick) -> Tick:
-    """Return the tick of a robot of a version; fingertips of version 1 had no orientation."""
+    """Return the tick as a robot of an older version publishes it.
+
+    In version 1 the orientations of `fingertip_poses` were identity.
+    """
     if interface_version != 1 or 'fingertip_poses' not in tick.readings:
         return tick
     poses = tick.readings['fingertip_poses'].reshape(-1, 7).copy()
@@ -269,7 +273,7 @@ def _result_differences(
     last: LoggedTick, status: EpisodeStatus, runner: EpisodeRunner, episode: Episode
 ) -> Iterator[Difference]:
     """Compare the record `episode_result` with the last tick."""
-    # All ticks of an episode may be there although its end was cut off.
+    # An interrupted recording can contain all ticks and no end of the episode.
     is_whole = runner.is_between_episodes and episode.result.get('complete') != 'false'
     expected = {**episode_result(status), 'complete': 'true' if is_whole else 'false'}
     # A file that was cut short may lack all but `complete`.
@@ -336,8 +340,10 @@ def _tick_differences(
     """Yield field, recorded and simulated value of each difference in the messages of a tick."""
     names = [message.topic.name for message in logged.published]
     wanted = [topic.name for topic, _ in expected]
-    if names != wanted:
-        yield 'topics', ', '.join(names), ', '.join(wanted)
+    for index, (name, other) in enumerate(zip_longest(names, wanted, fillvalue='nothing')):
+        if name != other:
+            yield f'topic of message {index}', name, other
+            break
     for message, (topic, data) in zip(logged.published, expected, strict=False):
         if message.data != data:
             where, recorded, simulated = _field_difference(topic, message.data, data)

@@ -45,7 +45,7 @@ def random_tick(task: TaskSpec, seed: int = 0) -> Tick:
 
 
 def sensed_topics(task: TaskSpec) -> list[str]:
-    """Topics that say what sensors say, in order."""
+    """Return the names of the topics with sensor readings, in order."""
     if task.robot.has_gripper_command:
         robot = ['joint_states', 'end_effector_pose', 'end_effector_twist']
     else:

@@ -52,7 +52,8 @@ class FetchConfig:
     Attributes:
         start: Initial positions of robot0:slide0, slide1, slide2.
         object_start: Initial qpos of the object, or None.
-        block_gripper: Whether the fingers are locked shut.
+        block_gripper: Whether each step shuts the fingers. At the reset they are open by less than
+            1 mm, as in Gymnasium-Robotics.
         gripper_extra_height: Added to the start height of the gripper.
         object_range: Half width of the square in which the object starts.
         target_range: Half width of the cube that contains the goals.

@@ -92,14 +92,16 @@ class Goals:
     """Rising multiples of the success thresholds, as `.5,1,2,4`. The reward of training becomes the
     share of them that the distance meets, times that of the rotation, minus 1."""
     strategy: Literal['final', 'future', 'episode', 'random', 'futureactual', 'none'] = 'future'
-    """Source of hindsight goals; `none` is without hindsight."""
+    """Where hindsight goals come from: the same episode (`final`, `future`, `episode`), any episode
+    (`random`), or half each `future` and desired goals of other episodes (`futureactual`). `none`
+    is without hindsight."""
     hindsight_k: Annotated[int, Range(1, 1000)] = 4
     """Replaced goals for each goal kept: k/(k+1) of a batch is relabelled. With `ppo` also the
     number of goals of each episode."""
     goals: dict[str, float] = field(default_factory=dict)
     """Mixture of goal sources instead of `strategy`: `future=.4,actual=.3`. The rest keeps its
-    goal. Also `displaced` (near the goal achieved before) and with `ppo` `outcome` (achieved by
-    other episodes)."""
+    goal. Also `actual` (desired goals of other episodes), `displaced` (near the goal achieved at
+    the start of the transition) and, with `ppo`, `outcome` (achieved by other episodes)."""
     goal_choice: Literal['uniform', 'bellman', 'uncertain'] = 'uniform'
     """Choice among 8 future goals: `uniform` (any), `bellman` (largest error of the value) or
     `uncertain` (largest difference between critics)."""
@@ -445,7 +447,8 @@ FIELDS = {each.name: each for each in _describe()}
 DEFAULTS = {name: each.default for name, each in FIELDS.items() if name != 'task'}
 
 
-# Fields that have an effect only with others: their names, what they need, and the test of it.
+# Fields that have an effect only together with others: their names; the needed field and value, in
+# words and as a function of the configuration.
 NEEDS: tuple[tuple[str, str, Callable[[Any], bool]], ...] = (
     (
         'subgoal_every polyak target_update_interval policy_delay target discount critics '
@@ -518,10 +521,10 @@ NEEDS: tuple[tuple[str, str, Callable[[Any], bool]], ...] = (
 # Values without effect that differ from the default: only `ddpg` takes random actions.
 WITHOUT_EFFECT: dict[str, Any] = {'random_epsilon': 0.0}
 
-# Sources of goals. `real` keeps the goal of the episode.
-STRATEGIES = ('future', 'final', 'episode', 'random')
-SOURCES = ('real', *STRATEGIES, 'actual', 'displaced', 'outcome')
-# Sources that depend on where the transition led.
+# Sources of goals: the functions in `experience.hindsight.SOURCES`, `real` (keeps the goal of the
+# episode) and, with `ppo` only, `outcome`.
+SOURCES = ('real', 'future', 'final', 'episode', 'random', 'actual', 'displaced', 'outcome')
+# Sources of goals that depend on what the robot did after the transition.
 FROM_THE_EPISODE = ('future', 'final', 'episode')
 # Tasks that ignore their gripper action.
 GAMBLE_TASKS = ('FetchReach', 'FetchPush')
@@ -642,7 +645,8 @@ def _rules_of_goals(config: TrainConfig) -> Iterator[tuple[bool, str]]:
     yield bool(goals) and c.strategy == 'none', f'goals {goals} excludes strategy none'
     yield 'outcome' in goals and c.algorithm != 'ppo', 'goals outcome needs algorithm ppo'
     yield (
-        c.goal_choice != 'uniform' and 'future' not in (goals or [c.strategy[:6]]),
+        c.goal_choice != 'uniform'
+        and 'future' not in (goals or [c.strategy.removesuffix('actual')]),
         f'goal_choice {c.goal_choice} needs future goals',
     )
     yield (

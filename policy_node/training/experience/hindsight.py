@@ -2,8 +2,10 @@
 
 Goals are replaced when a batch is drawn, and rewards are computed for the new goals.
 Andrychowicz et al. 2017, "Hindsight Experience Replay" (arXiv 1707.01495). The `futureactual`
-mixture is from Pitis et al. 2020 (arXiv 2007.02832). A new source of goals is a function in
-`SOURCES` and a name in `configuration.config.SOURCES`.
+mixture is from Pitis et al. 2020 (arXiv 2007.02832).
+
+A new source of goals needs a function in `SOURCES` and its name in `configuration.config.SOURCES`.
+A new strategy is such a source that is also a value of the field `strategy` there.
 """
 
 from __future__ import annotations
@@ -112,9 +114,9 @@ def _actual(starts: Starts, generator: np.random.Generator) -> Array32:
 def _displaced(starts: Starts, generator: np.random.Generator) -> Array32:
     """Return goals near the goal achieved at the start of each transition.
 
-    A goal that is chosen because a step led there teaches the critic that such steps lead there.
-    With contacts this is partly luck. So the start is displaced by an independent motion: between
-    two states of a random episode, at most ten ticks apart.
+    The displacement is a motion between two states of a random episode, at most ten ticks apart.
+    It is independent of the transition. `future` goals depend on where the transition led: where
+    contacts make this random, their values are too high.
     """
     episodes, count = starts.episodes, len(starts.row)
     row = generator.integers(len(episodes), size=count)

@@ -92,7 +92,7 @@ def make_sampler(
 ) -> TransitionSampler:
     """Return the sampler of transitions that the configuration selects.
 
-    Two samplers ask a learner, `judge`; without it the plain one takes their place.
+    Two samplers need a learner, `judge`. Without one, the plain sampler replaces them.
 
     Raises:
         ValueError: If the configuration replaces the own reward of a third-party task.

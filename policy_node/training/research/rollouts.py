@@ -293,7 +293,8 @@ class OnPolicyExperience(Experience):
     def mixture(self) -> dict[str, float]:
         """Return the probability of each goal source, for the statistics of goals.
 
-        These use single transitions, so goals of the episode replace outcomes; both spread alike.
+        These statistics use single transitions, which have no `outcome`: `episode` goals, of the
+        same distribution, take its share.
         """
         found = dict(super().mixture())
         if _OUTCOME in found:

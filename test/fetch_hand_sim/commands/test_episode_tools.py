@@ -152,7 +152,7 @@ AFTER_POSITIONS = 2 * (8 * len(task_spec('FetchReach').robot.joints) + 8)
     ('change', 'tick', 'field'),
     [
         (flip('joint_states', 7, -AFTER_POSITIONS - 8), 7, 'joint_states.position[14]'),
-        (without('joint_states', 3), 3, 'topics'),
+        (without('joint_states', 3), 3, 'topic of message 1'),
         (flip('episode_status', 0, -8), 0, 'episode_status'),
     ],
 )

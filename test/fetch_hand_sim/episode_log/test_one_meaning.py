@@ -306,9 +306,9 @@ def assert_same(path, original):
     assert [row[2:] for row in found.rows()] == [row[2:] for row in expected.rows()]
     (one,), (other,) = load_episodes(original), load_episodes(path)
     assert one.observations['observation'].tobytes() == other.observations['observation'].tobytes()
-    assert read_summary(path).message_count == read_summary(original).message_count == 509
+    assert read_summary(path).message_count == read_summary(original).message_count
     assert len(load_recording(path).frames) == 51
-    assert len(ReplaySchedule(path).messages) == 459
+    assert len(ReplaySchedule(path).messages) == len(ReplaySchedule(original).messages)
     result = check_episode(path)
     assert (result.difference, result.ticks) == (None, 51)
 
@@ -399,7 +399,7 @@ def later_command(parts):
         ('episode_result return', lambda p: p.with_result(**{'return': '0.0'})),
         ('episode_result complete', lambda p: p.with_result(complete=None)),
         ('episode_result complete', lambda p: p.with_result(complete='maybe')),
-        ('topics', without_the_last_command),
+        ('topic', without_the_last_command),
         ('log time of commands', later_command),
         ('publish time of', lambda p: p.with_message(100, publish_time=p.last_ns)),
         ('sequence number of', lambda p: p.with_message(100, sequence=7)),

@@ -1,4 +1,4 @@
-"""Hindsight relabelling on episodes whose goals say where they come from."""
+"""Hindsight relabelling on episodes whose goals contain the episode and tick they come from."""
 
 from __future__ import annotations
 
@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 from msgs_spec.rotations import quaternion_from_axis_angle
+from policy_node.training.configuration import config
 from policy_node.training.configuration.flat import parse_value
 from policy_node.training.experience.hindsight import (
+    SOURCES,
     draw_sources,
     goal_mixture,
     goals_of,
@@ -17,7 +19,9 @@ from policy_node.training.experience.hindsight import (
 from policy_node.training.experience.replay import Episodes, Starts
 from policy_node.training.experience.sampling import TransitionSampler
 
-COUNT, TICKS = 6, 10
+COUNT, TICKS = 6, 14
+# Longest displacement, ticks.
+LONGEST = 10
 
 
 @pytest.fixture
@@ -42,6 +46,10 @@ def draw(episodes, strategy):
     return row, tick, relabelled(episodes, row, tick, goal_mixture(strategy, 4), generator)
 
 
+def test_the_configuration_allows_the_sources_that_exist():
+    assert set(config.SOURCES) - {'real', 'outcome'} == set(SOURCES)
+
+
 def test_none_keeps_every_goal(episodes):
     row, _, goal = draw(episodes, 'none')
     assert (goal == episodes.desired_goal[row]).all()
@@ -60,7 +68,7 @@ def test_none_keeps_every_goal(episodes):
 def test_goals_are_from_the_episode_and_the_ticks_of_their_strategy(
     episodes, strategy, kept, own_desired, own_achieved
 ):
-    """A share of goals is kept; of these, and of those achieved, a share is of the same episode."""
+    """`kept` is the share of desired goals; `own_...` are the shares from the same episode."""
     row, tick, goal = draw(episodes, strategy)
     desired, achieved = goal[:, 0] >= 100, goal[:, 0] < 100
     assert desired.mean() == pytest.approx(kept, abs=0.015)
@@ -73,13 +81,13 @@ def test_goals_are_from_the_episode_and_the_ticks_of_their_strategy(
         assert state.mean() == pytest.approx((first + TICKS) / 2, abs=0.35)
 
 
-def test_displaced_goals_are_near_the_state_and_know_nothing_of_the_step(episodes):
+def test_displaced_goals_are_near_the_state_and_do_not_depend_on_the_step(episodes):
     generator = np.random.default_rng(2)
     row, tick = (generator.integers(limit, size=5_000) for limit in (COUNT, TICKS))
     goal = relabelled(episodes, row, tick, {'displaced': 1.0}, generator)
     # Each episode here moves by one a tick.
     moved = goal - np.stack([row, tick], axis=1)
-    assert set(map(tuple, moved.tolist())) == {(0.0, float(span)) for span in range(1, 11)}
+    assert set(map(tuple, moved.tolist())) == {(0.0, float(span)) for span in range(1, LONGEST + 1)}
     # The same draws where all these steps lead elsewhere: only what is drawn there differs.
     changed = episodes.achieved_goal.copy()
     changed[0, 5:] += 50.0
@@ -100,7 +108,7 @@ def test_no_displacement_is_taken_from_after_an_end(episodes):
     starts = Starts(cut, row, tick, valid)
     source = np.zeros(len(row), np.int64)
     goal = goals_of(starts, source, ['displaced'], np.random.default_rng(5))
-    assert set(goal[:, 1].tolist()) == {float(span) for span in range(1, TICKS + 1)}
+    assert set(goal[:, 1].tolist()) == {float(span) for span in range(1, LONGEST + 1)}
 
 
 def test_displaced_poses_are_turned_as_another_episode_turned():
@@ -119,7 +127,7 @@ def test_displaced_poses_are_turned_as_another_episode_turned():
     turned = 2.0 * np.arccos((goal[:, 3:] * poses[row, tick, 3:]).sum(axis=1).clip(-1.0, 1.0))
     steps = turned / (angle[1] - angle[0])
     np.testing.assert_allclose(steps, steps.round(), atol=1e-4)
-    assert set(steps.round().astype(int).tolist()) == set(range(1, TICKS + 1))
+    assert set(steps.round().astype(int).tolist()) == set(range(1, LONGEST + 1))
 
 
 @pytest.mark.parametrize(

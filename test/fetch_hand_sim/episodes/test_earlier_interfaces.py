@@ -1,4 +1,4 @@
-"""Orientations of the fingertips: measured now, identity in episodes of earlier robots."""
+"""Episodes of earlier interface versions; orientations of the fingertips, new in version 2."""
 
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ from fetch_hand_sim.episodes.checker import check_episode
 from fetch_hand_sim.simulation import Simulation
 from msgs_spec.robots import FINGERTIPS
 from msgs_spec.rotations import quaternion_to_matrix
+from msgs_spec.tick import TickEncoder
+from msgs_spec.topics import INTERFACE_VERSION, TopicSpec
 from support.episode_recorder import Recorder
 
 
@@ -61,3 +63,13 @@ def test_episodes_without_orientations_are_checked_and_loaded_as_the_others(tmp_
     (before,), (now,) = map(load_episodes, paths)
     for name, values in before.observations.items():
         assert values.tobytes() == now.observations[name].tobytes()
+
+
+@pytest.mark.parametrize(('since', 'is_expected'), [(INTERFACE_VERSION, True), (99, False)])
+def test_the_check_does_not_expect_topics_that_are_newer_than_the_file(
+    tmp_path, monkeypatch, since, is_expected
+):
+    path = Recorder('FetchReach').record(EpisodeDirectory(tmp_path))
+    added, encode = TopicSpec('added', 'std_msgs/msg/Float64', '', since=since), TickEncoder.encode
+    monkeypatch.setattr(TickEncoder, 'encode', lambda *a, **k: [*encode(*a, **k), (added, b'')])
+    assert (check_episode(path).difference is not None) == is_expected
