@@ -90,7 +90,7 @@ def test_an_episode_ended_by_a_user_method_has_no_time_limit():
 
 
 def assert_goals_are_exchanged(model):
-    """Goals of sampled transitions are others than those pursued, and so are the rewards."""
+    """Goals of sampled transitions have goals of other states, and the rewards for these goals."""
     batch = model.replay_buffer.sample(256)
     goals = batch.observations['desired_goal'].numpy()
     reached = np.linalg.norm(batch.next_observations['achieved_goal'].numpy() - goals, axis=1)
