@@ -61,7 +61,7 @@ else
 	@$(BIN)/python -m fetch_hand_sim demo --task $(TASK) --episodes $(EPISODES)
 endif
 
-# Tests that start nodes mostly wait, so four of them share the machine; tests marked `alone` have it for
+# Tests that start nodes mostly wait, so five of them share the machine; tests marked `alone` have it for
 # themselves. Beside the other tests, which compute, some node tests fail now and then on two cores.
 # `--reruns 1`: another process of a shared machine may delay a test by seconds once.
 NODE_TESTS := test/nodes test/fetch_hand_sim/replay_node \
@@ -79,7 +79,7 @@ test-alone: env
 	$(BIN)/python -m pytest -m 'alone and not release' --reruns 1 $(NODE_TESTS)
 
 test-nodes: env
-	$(BIN)/python -m pytest -m 'not alone and not release' --reruns 1 -n 4 --dist worksteal $(NODE_TESTS)
+	$(BIN)/python -m pytest -m 'not alone and not release' --reruns 1 -n 5 --dist worksteal $(NODE_TESTS)
 
 test-others: env
 	$(BIN)/python -m pytest --reruns 1 -n auto --maxprocesses 4 --dist worksteal $(addprefix --ignore=,$(NODE_TESTS))
