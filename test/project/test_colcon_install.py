@@ -106,7 +106,7 @@ def test_colcon_test_runs_the_tests(workspace):
     command = [sys.executable, '-m', 'pytest', '--collect-only', '-q', file]
     listing = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
     expected = listing.count('::')
-    assert expected > 10
+    assert expected > 5
     assert counts == {'tests': expected, 'failures': 0, 'errors': 0, 'skipped': 0}
 
 
