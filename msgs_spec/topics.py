@@ -264,9 +264,9 @@ def relative_name(resolved: str) -> str:
 def topics(task: TaskSpec) -> tuple[TopicSpec, ...]:
     """Return all topics of a task.
 
-    The order is part of the contract: first the published topics in the order of a tick, of which
-    `applied_command` is the last, then the subscribed ones. A new published topic also needs its
-    value in `tick.TickEncoder.encode`, and a new `INTERFACE_VERSION`, which is its `since`.
+    The order is part of the contract. Published topics come first, in the order of a tick, and the
+    last of them is `applied_command`. Subscribed topics follow. A new published topic also needs
+    its value in `tick.TickEncoder.encode`, and a new `INTERFACE_VERSION`, which is its `since`.
     """
     clock = TopicSpec(
         '/clock', 'rosgraph_msgs/msg/Clock', 'Simulated time, once per tick.', qos=CLOCK
