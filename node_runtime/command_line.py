@@ -62,6 +62,17 @@ class UsageError(CommandError):
     exit_code = EXIT_USAGE
 
 
+@contextmanager
+def usage_errors(
+    errors: type[Exception] | tuple[type[Exception], ...] = ValueError, prefix: str = ''
+) -> Iterator[None]:
+    """Turn these errors of the block into a `UsageError` with `prefix` before the message."""
+    try:
+        yield
+    except errors as error:
+        raise UsageError(f'{prefix}{error}') from None
+
+
 class CommandParser(argparse.ArgumentParser):
     """An argument parser with one-line errors and suggestions for misspelt names."""
 

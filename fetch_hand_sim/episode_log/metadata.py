@@ -268,8 +268,8 @@ def episode_metadata(
 
     Args:
         episode: Number of the episode in this run, from 0; file names count over all runs.
-        timing: Unit of step counts, recorded only if it is `seconds` and the rate is not 25 Hz.
-            Files without it mean `ticks`, as those of version 1.0.
+        timing: Quantities kept at other rates, recorded only if it is `seconds` and the rate is
+            not 25 Hz. Files without it mean `ticks`, as those of version 1.0.
         joint_prefix: Recorded only if it is not the usual one.
         model_sha256: Fingerprint of the compiled model, see `model_sha256`.
         perturb_limit: Largest force of a push, N; recorded only if pushes are on.

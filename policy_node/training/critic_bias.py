@@ -17,10 +17,10 @@ from pathlib import Path
 from node_runtime.command_line import (
     EXIT_SUCCESS,
     CommandParser,
-    UsageError,
     require_extra,
     run_command,
     say,
+    usage_errors,
     whole_number,
 )
 
@@ -49,10 +49,8 @@ def _run(options: argparse.Namespace) -> int:
 
     from policy_node.training.values_and_returns import measure
 
-    try:
+    with usage_errors():
         comparisons = measure(options.run, options.episodes)
-    except ValueError as error:
-        raise UsageError(str(error)) from None
     say(f'{options.run}: {options.episodes} new episodes, without noise')
     table = Table()
     for name in ('tick', 'value', 'return', 'difference', 'correlation'):

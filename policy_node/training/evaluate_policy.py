@@ -16,6 +16,7 @@ from node_runtime.command_line import (
     CommandParser,
     progress,
     run_command,
+    usage_errors,
     whole_number,
 )
 from node_runtime.signals import EXIT_INTERRUPTED
@@ -37,7 +38,6 @@ from policy_node.training.policy_options import (
     make_chosen_simulation,
     policy_errors,
     require_writable,
-    usage_errors,
     write_result,
 )
 
@@ -78,7 +78,7 @@ def _run(options: argparse.Namespace) -> int:
     simulation = make_chosen_simulation(options, loaded)
     other = None
     if options.against is not None:
-        with usage_errors('--against: '):
+        with usage_errors(prefix='--against: '):
             other = load_policy(options.against, loaded.task, trust=options.trust)
             other.require_rate(simulation.control_hz)
     for file in (options.json, options.csv):

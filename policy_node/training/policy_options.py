@@ -10,7 +10,7 @@ from pathlib import Path
 
 from fetch_hand_sim.simulation import Simulation
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ, REWARD_TYPES, SUCCESS_RULES, TASKS
-from node_runtime.command_line import CommandError, UsageError, whole_number
+from node_runtime.command_line import CommandError, UsageError, usage_errors, whole_number
 from policy_node.policies.files import write_file
 from policy_node.policies.loading import POLICY_NAMES, load_policy
 from policy_node.policies.policy import LoadedPolicy, PolicyError
@@ -58,15 +58,6 @@ def load_chosen_policy(options: argparse.Namespace) -> LoadedPolicy:
     with usage_errors():
         loaded = load_policy(options.policy, options.task, trust=options.trust)
     return loaded
-
-
-@contextmanager
-def usage_errors(prefix: str = '') -> Iterator[None]:
-    """Turn a `ValueError` in the block into a `UsageError` with `prefix` before its message."""
-    try:
-        yield
-    except ValueError as error:
-        raise UsageError(f'{prefix}{error}') from None
 
 
 @contextmanager

@@ -72,7 +72,7 @@ def same(first: dict[str, torch.Tensor], second: dict[str, torch.Tensor]) -> boo
 
 
 def outcomes_of(success: Any, **others: Any) -> EpisodeOutcomes:
-    """Outcomes of as many episodes; besides `success` and `others`, all values are 0."""
+    """Return outcomes of `len(success)` episodes. Values that are not given are 0."""
     zeros = {name: np.zeros(len(success)) for name in EpisodeOutcomes.__slots__}
     return EpisodeOutcomes(**zeros | {'success_gymnasium': np.array(success)} | others)
 

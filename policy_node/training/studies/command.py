@@ -19,7 +19,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -35,6 +35,7 @@ from node_runtime.command_line import (
     given_command,
     require_extra,
     run_command,
+    usage_errors,
     whole_number,
 )
 from policy_node.policies.files import write_file
@@ -182,7 +183,7 @@ def _run(options: argparse.Namespace, command: str) -> int:
     study: Study = options.study
     output = options.output or study.output
     report = options.report or (output if study.ships else Path('docs') / 'research' / study.name)
-    with _usage_errors():
+    with usage_errors((ValueError, TypeError)):
         jobs = jobs_from_arguments(options)
         if not study.ships:
             require_alike(study, jobs, report)
@@ -212,15 +213,6 @@ def _run(options: argparse.Namespace, command: str) -> int:
     if study.ships and status <= EXIT_FAILURE and not _ship_all(options, finished, output, report):
         return EXIT_FAILURE
     return status
-
-
-@contextlib.contextmanager
-def _usage_errors() -> Iterator[None]:
-    """Turn a ValueError of the body into a usage error, one line and exit code 2."""
-    try:
-        yield
-    except (ValueError, TypeError) as error:
-        raise UsageError(str(error)) from None
 
 
 def _not_stored(jobs: Sequence[Job], folder: Path) -> list[Job]:

@@ -41,7 +41,7 @@ from policy_node.training.studies.store import (
 from policy_node.training.studies.study import Job, Study, to_settings
 from support import ROOT
 from support.full_disk import files_at_most
-from support.runs import one_line
+from support.runs import one_line, options_of
 
 SMALL = ['--study', 'unbiased', '--seeds', '0', '--steps', '800', '--episodes', '4']
 SMALL += ['--set', 'num_envs=4', '--set', 'updates_per_cycle=2', '--set', 'evaluation_episodes=4']
@@ -326,8 +326,8 @@ def test_a_full_disk_leaves_stored_runs_and_page_as_they_were(
 
 
 PAGE = ROOT / 'docs' / 'research' / 'studies.md'
-FEW = ['--seeds', '0', '--steps', '800', '--episodes', '2', '--set', 'num_envs=8']
-FEW += ['--set', 'evaluation_episodes=4', '--set', 'evaluate_every=400']
+FEW = ['--seeds', '0', '--steps', '800', '--episodes', '2']
+FEW += options_of(num_envs=8, evaluation_episodes=4, evaluate_every=400)
 
 
 @pytest.fixture
