@@ -264,9 +264,11 @@ def relative_name(resolved: str) -> str:
 def topics(task: TaskSpec) -> tuple[TopicSpec, ...]:
     """Return all topics of a task.
 
-    The order is part of the contract. Published topics come first, in the order of a tick, and the
-    last of them is `applied_command`. Subscribed topics follow. A new published topic also needs
-    its value in `tick.TickEncoder.encode`, and a new `INTERFACE_VERSION`, which is its `since`.
+    The order is part of the contract. Published topics come first, in the order of a tick:
+    `applied_command` is the last topic of every tick, `episode_status` follows at some ticks.
+    Subscribed topics come next. A new topic of every tick stands before `applied_command`. It also
+    needs its value in `tick.TickEncoder.encode`, and a new `INTERFACE_VERSION`, which is its
+    `since`; then `make tables` writes the documentation.
     """
     clock = TopicSpec(
         '/clock', 'rosgraph_msgs/msg/Clock', 'Simulated time, once per tick.', qos=CLOCK

@@ -34,6 +34,7 @@ from node_runtime.command_line import (
     require_extra,
     run_command,
     say,
+    usage_errors,
 )
 
 _NAME = 'fetch_hand_sim episodes export'
@@ -79,7 +80,7 @@ def _run(options: argparse.Namespace) -> int:
     skipped: list[EpisodeReadError] = []
     by_task: dict[str, list[EpisodeArrays]] = {}
     filtered = 0
-    try:
+    with usage_errors(EpisodeReadError):
         paths = expand_episodes(options.path)
         with progress('episodes', len(paths)) as advance:
             for path in paths:
@@ -88,8 +89,6 @@ def _run(options: argparse.Namespace) -> int:
                 except EpisodeReadError as error:
                     skipped.append(error)
                 advance(1)
-    except EpisodeReadError as error:
-        raise UsageError(str(error)) from None
     for reason in skipped:
         complain(_NAME, f'skipped {reason}')
     by_task = {task: episodes for task, episodes in by_task.items() if episodes}

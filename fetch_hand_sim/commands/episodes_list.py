@@ -32,9 +32,9 @@ from node_runtime.command_line import (
     EXIT_FAILURE,
     EXIT_SUCCESS,
     CommandParser,
-    UsageError,
     complain,
     run_command,
+    usage_errors,
 )
 
 _NAME = 'fetch_hand_sim episodes list'
@@ -115,11 +115,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(options: argparse.Namespace) -> int:
     errors: list[EpisodeReadError] = []
-    try:
+    with usage_errors((EpisodeReadError, EpisodeLogError)):
         episodes = list(read_each(find_episodes(options.directory), read_summary, errors.append))
         leftovers = find_leftovers(options.directory)
-    except (EpisodeReadError, EpisodeLogError) as error:
-        raise UsageError(str(error)) from None
     shown = [each for each in episodes if is_wanted(options, each.metadata.get('task'), each)]
     if options.json:
         print(json.dumps([_as_json(episode) for episode in shown], indent=2))

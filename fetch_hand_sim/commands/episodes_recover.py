@@ -30,6 +30,7 @@ from node_runtime.command_line import (
     progress,
     run_command,
     say,
+    usage_errors,
 )
 
 _NAME = 'fetch_hand_sim episodes recover'
@@ -47,13 +48,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(options: argparse.Namespace) -> int:
-    try:
+    with usage_errors(EpisodeLogError):
         # Path.is_dir raises where a name is too long.
         if not os.path.isdir(options.directory):
             raise UsageError(f'{options.directory} is not a folder')
         leftovers = _find(options.directory)
-    except EpisodeLogError as error:
-        raise UsageError(str(error)) from None
     failures = 0
     with progress('unfinished episodes', len(leftovers)) as advance:
         for leftover in leftovers:

@@ -68,6 +68,11 @@ class Difference:
         )
 
 
+def _short(text: str) -> str:
+    """Return the first characters of a hash or version, with the `-dirty` of a revision."""
+    return text[:12] + ('-dirty' if text.endswith('-dirty') else '')
+
+
 def _difference(
     tick: int, stamp_ns: int, field: str, recorded: object, simulated: object
 ) -> Difference:
@@ -170,8 +175,8 @@ def _start_differences(
         is_software = name in _SOFTWARE or name.endswith('_version')
         given = recorded.get(name, value if is_software else 'nothing')
         if given != value and is_software:
-            short = one_line(given, longest=12)
-            result.changed.append(f'{name.removesuffix("_version")} {short} -> {value[:12]}')
+            changed = f'{_short(one_line(given))} -> {_short(value)}'
+            result.changed.append(f'{name.removesuffix("_version")} {changed}')
         elif given != value:
             yield _difference(0, stamp_ns, f'metadata {name}', given, value)
     model = episode.attachments.get('model.xml')

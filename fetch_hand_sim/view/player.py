@@ -26,7 +26,7 @@ from fetch_hand_sim.view.requests import (
 )
 from fetch_hand_sim.view.session import Requests, Session
 from fetch_hand_sim.view.web import FrameRate, announce, open_page
-from node_runtime.command_line import EXIT_SUCCESS, UsageError
+from node_runtime.command_line import EXIT_SUCCESS, usage_errors
 from node_runtime.node_main import StopSignals
 
 # Seconds for which the last frame stays before the episode starts again.
@@ -42,11 +42,9 @@ def run_files(options: argparse.Namespace) -> int:
         CommandError: If the page cannot be served.
     """
     stop = StopSignals()
-    try:
+    with usage_errors(EpisodeReadError):
         paths = find_playable(options.path)
         player = Player(paths, may_act=not options.read_only)
-    except EpisodeReadError as error:
-        raise UsageError(str(error)) from None
     plugins = [Page(tuple(paths)), Requests(player.perform)]
     handle, address = open_page(
         options.host, options.port, plugins, FrameRate(), is_read_only=options.read_only

@@ -11,9 +11,9 @@ from node_runtime.command_line import (
     EXIT_FAILURE,
     EXIT_SUCCESS,
     CommandParser,
-    UsageError,
     require_extra,
     run_command,
+    usage_errors,
 )
 from policy_node.training.policy_options import add_batch_options
 
@@ -42,7 +42,7 @@ def _run(options: argparse.Namespace) -> int:
     require_extra('train')
     from policy_node.training.runs.shipping import ship
 
-    try:
+    with usage_errors((ValueError, OSError)):
         better = ship(
             options.run,
             options.actors,
@@ -52,8 +52,6 @@ def _run(options: argparse.Namespace) -> int:
             name=options.checkpoint,
         )
         return EXIT_SUCCESS if better else EXIT_FAILURE
-    except (ValueError, OSError) as error:
-        raise UsageError(str(error)) from None
 
 
 if __name__ == '__main__':

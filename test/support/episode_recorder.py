@@ -23,7 +23,7 @@ from msgs_spec.codecs import TopicCodec
 from msgs_spec.robots import command_from_action
 from msgs_spec.tasks import Timing
 from msgs_spec.tick import Tick, TickEncoder
-from msgs_spec.topics import TopicSpec, topic
+from msgs_spec.topics import INTERFACE_VERSION, TopicSpec, topic
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,9 @@ class Recorder:
         control_hz: float = 25.0,
         first_seed: int = 0,
         timing: Timing = 'seconds',
+        interface_version: int = INTERFACE_VERSION,
     ) -> None:
+        self.interface_version = interface_version
         self.simulation = Simulation(task, num_threads=1, control_hz=control_hz, timing=timing)
         self.spec = self.simulation.spec
         self.runner = EpisodeRunner(self.simulation, first_seed=first_seed)
@@ -63,7 +65,7 @@ class Recorder:
         self._command_encoder = TopicCodec(self.commands)
 
     def metadata(self, started: str | None = None) -> dict[str, str]:
-        return episode_metadata(
+        metadata = episode_metadata(
             self.spec,
             episode=self.runner.episode,
             seed=self.runner.seed,
@@ -75,10 +77,15 @@ class Recorder:
             source_revision='12e4567',
             started=started,
         )
+        metadata['interface_version'] = str(self.interface_version)
+        if self.interface_version == 1:
+            del metadata['interface_version']
+        return metadata
 
     def encode(self, tick: Tick) -> list[tuple[TopicSpec, bytes]]:
-        """The messages of a tick, as the robot publishes them."""
-        return self._encoder.encode(tick, latched=tick.status.phase != 'running')
+        """The messages of a tick, as the robot of the interface version publishes them."""
+        messages = self._encoder.encode(tick, latched=tick.status.phase != 'running')
+        return [each for each in messages if each[0].since <= self.interface_version]
 
     def ticks(self) -> list[RecordedTick]:
         """Runs the next episode to its end."""

@@ -174,9 +174,11 @@ def test_check_compares_applied_commands_with_received_ones(tmp_path):
 
 
 def test_check_names_the_version_that_changed(reach, tmp_path):
-    path = rewrite(min(reach.iterdir()), tmp_path, mujoco_version='3.9.0')
-    result = check_episode(path)
-    assert [change.split()[:2] for change in result.changed] == [['mujoco', '3.9.0']]
+    revision = f'{"12e4567" * 6}-dirty'
+    changes = {'mujoco_version': '3.9.0', 'source_revision': revision}
+    result = check_episode(rewrite(min(reach.iterdir()), tmp_path, **changes))
+    changed = sorted(change.split()[:2] for change in result.changed)
+    assert changed == [['mujoco', '3.9.0'], ['source_revision', '12e456712e45-dirty']]
 
 
 def test_check_runs_goals_that_were_set_on_the_way(tmp_path):

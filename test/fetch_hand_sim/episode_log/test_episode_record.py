@@ -6,6 +6,7 @@ import pytest
 
 from fetch_hand_sim.episode_log import EpisodeOutcome, EpisodeRecord, episode_metadata
 from msgs_spec.tasks import TASKS
+from msgs_spec.topics import INTERFACE_VERSION
 
 
 def metadata(hz: float = 500 / 3, **changes: str) -> dict[str, str]:
@@ -27,7 +28,7 @@ def test_what_is_written_is_read_back():
     assert (record.task, record.episode, record.seed) == (TASKS['FetchPush'], 3, 2**63 - 1)
     assert (record.reward_type, record.success_rule) == ('dense', 'paper')
     assert (record.control_hz, record.joint_prefix) == (500 / 3, 'robot0:')
-    assert record.interface_version == 2
+    assert record.interface_version == INTERFACE_VERSION
     assert record.timing == 'seconds'
 
 

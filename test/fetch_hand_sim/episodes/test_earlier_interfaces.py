@@ -43,10 +43,8 @@ def test_poses_are_those_of_the_sites(task):
 class FirstRecorder(Recorder):
     """A robot of interface version 1, whose fingertips have no orientation."""
 
-    def metadata(self, started=None):
-        metadata = super().metadata(started)
-        del metadata['interface_version']
-        return metadata
+    def __init__(self, task):
+        super().__init__(task, interface_version=1)
 
     def encode(self, tick):
         poses = tick.readings['fingertip_poses'].reshape(5, 7).copy()

@@ -15,7 +15,7 @@ from fetch_hand_sim.simulation import Simulation
 from msgs_spec.codecs import build_message
 from msgs_spec.schemas import serialize
 from msgs_spec.tasks import task_spec
-from msgs_spec.topics import topic
+from msgs_spec.topics import INTERFACE_VERSION, topic
 from support.episode_recorder import Recorder, rested_episode
 
 SECOND = 10**9
@@ -77,14 +77,11 @@ def test_between_episodes_no_goal_is_taken(runner):
         accept_goal(runner, SET_GOAL, goal_message())
 
 
-def record_with_goals(tmp_path, interface_version=None):
+def record_with_goals(tmp_path, interface_version):
     """Logs an episode with goals on the way, as the robot of an interface version handles them."""
-    recorder = Recorder('FetchReach')
-    metadata = recorder.metadata()
-    if interface_version == 1:
-        del metadata['interface_version']
+    recorder = Recorder('FetchReach', interface_version=interface_version)
     runner = recorder.runner
-    writer = EpisodeDirectory(tmp_path).begin('FetchReach', 0, metadata)
+    writer = EpisodeDirectory(tmp_path).begin('FetchReach', 0, recorder.metadata())
     goals = {
         5: goal_message([1.0, 1e9, 0.5]),
         10: goal_message([1.2, 0.8, 0.5], 'base_link'),
@@ -94,8 +91,8 @@ def record_with_goals(tmp_path, interface_version=None):
         30: goal_message([1.3, 0.6, 0.5]),
     }
     taken = 0
-    for number, (tick, messages) in enumerate(rested_episode(runner)):
-        writer.write_tick(tick.stamp_ns, messages)
+    for number, (tick, _) in enumerate(rested_episode(runner)):
+        writer.write_tick(tick.stamp_ns, recorder.encode(tick))
         if number in goals:
             writer.write_received(SET_GOAL, serialize(SET_GOAL.type_name, goals[number]))
             with suppress(ValueError):
@@ -104,7 +101,7 @@ def record_with_goals(tmp_path, interface_version=None):
     return writer.finish({}), taken
 
 
-@pytest.mark.parametrize(('interface_version', 'taken'), [(None, 2), (1, 4)])
+@pytest.mark.parametrize(('interface_version', 'taken'), [(INTERFACE_VERSION, 2), (1, 4)])
 def test_the_check_takes_the_goals_that_the_robot_took(tmp_path, interface_version, taken):
     path, count = record_with_goals(tmp_path, interface_version)
     assert count == taken
