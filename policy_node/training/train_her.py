@@ -140,7 +140,10 @@ def _read_experience(config: TrainConfig, directory: Path | None) -> Episodes | 
     if directory is None:
         return None
     excluded = {
-        'algorithm ppo': (config.algorithm == 'ppo', 'it learns only from its own episodes'),
+        f'algorithm {config.algorithm}': (
+            config.algorithm in ('ppo', 'imitation'),
+            'it learns only from its own episodes',
+        ),
         'longest_hold above 1': (config.longest_hold > 1, 'logged actions have no length'),
         'subgoal_every': (config.subgoal_every > 0, 'logged episodes have no subgoals'),
         'gamble': (config.gamble, 'in logged episodes gambles end nothing'),

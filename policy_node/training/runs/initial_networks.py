@@ -24,7 +24,7 @@ from policy_node.training.research.registry import (
     network_shape,
     without_input,
 )
-from policy_node.training.runs.run_folder import STATE_FILE, companion_file
+from policy_node.training.runs.run_folder import LATEST_FILE, STATE_FILE, companion_file
 from policy_node.training.runs.training_state import TrainingState, part_of, read_state
 
 # Updates of the critics alone if a random critic starts beside a trained actor: the gradient of an
@@ -191,6 +191,10 @@ def read_initial_networks(name: str) -> InitialNetworks:
         ValueError: If the actor or run is missing or damaged.
     """
     path = Path(os.path.expanduser(name))
+    latest = path / LATEST_FILE
+    if latest.is_file() and not (path / STATE_FILE).is_file():
+        # Runs of recipe `robust` have no training state.
+        return _of_actor(str(latest), latest)
     return _of_run(path) if path.is_dir() else _of_actor(name, actor_path(name))
 
 

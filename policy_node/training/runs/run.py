@@ -103,7 +103,10 @@ def resumed_config(
             cannot change.
     """
     if not (folder / STATE_FILE).is_file():
-        raise ValueError(f'{folder} is not the folder of a run: it has no {STATE_FILE}')
+        raise ValueError(
+            f'{folder} has no {STATE_FILE}: it contains no run, or one of recipe robust, which '
+            'cannot be resumed'
+        )
     stored = read_state(folder / STATE_FILE).extra['config']
     for name, chosen in (('task', task), ('recipe', recipe)):
         if chosen not in (None, stored.get(name)):

@@ -55,7 +55,7 @@ def set_former_run_aside(folder: Path) -> str:
     Returns:
         A sentence that names both folders; '' if there were no files.
     """
-    names = (BEST_FILE, LATEST_FILE, PROGRESS_FILE, CURVE_FILE, BOARD_FOLDER)
+    names = (BEST_FILE, LATEST_FILE, PROGRESS_FILE, CURVE_FILE, COMMAND_FILE, BOARD_FOLDER)
     found = [folder / name for name in names if (folder / name).exists()]
     found += folder.glob(f'*{REPLAY_FILE}')
     if not found:

@@ -393,6 +393,7 @@ def test_a_run_writes_a_policy_with_past_actions(tmp_path):
     assert read_progress(run / 'progress.csv')[-1]['eval_success'] > 0.7
     state = actor.predict({'observation': np.zeros(10), 'desired_goal': np.zeros(3)})[1]
     assert state is not None
+    assert read_initial_networks(str(run)).shape == actor.shape, 'it has no training state'
 
 
 def test_a_policy_without_one_critic_to_weigh_its_values_is_one_line(tmp_path, capsys):

@@ -301,7 +301,7 @@ def test_networks_whose_files_could_not_be_read_are_refused_at_once(tmp_path):
 def test_a_new_run_sets_the_files_of_an_earlier_one_aside(tmp_path, capsys):
     """Otherwise the best actor of the earlier run would stay, even of another task."""
     (tmp_path / 'tensorboard').mkdir()
-    names = 'best.safetensors', '1.replay.safetensors', 'tensorboard/events', 'progress.csv'
+    names = 'best.safetensors', '1.replay.safetensors', 'tensorboard/events', 'command.txt'
     for part in ('former1', 'former2'):
         for name in (*names, 'mine'):
             (tmp_path / name).write_text(f'{part} {name}')
@@ -391,7 +391,8 @@ def test_two_workers_agree():
         ('--task FetchReach --set gamma=.9 --gamma .95', '--gamma 0.95 excludes --set gamma=0.9'),
         ('--task FetchReach --replay-transitions 1000 --learning-starts 1001', '1001 or more'),
         (f'{PPO} --task FetchReach --from-episodes .', 'ppo excludes --from-episodes'),
-        ('--resume nowhere', 'nowhere is not the folder of a run'),
+        ('--recipe robust --task FetchReach --from-episodes .', 'imitation excludes --from-epis'),
+        ('--resume nowhere', 'nowhere has no training_state.safetensors'),
     ],
 )
 def test_bad_usage_is_one_line_and_exit_status_2(arguments, message, capsys, tmp_path):
