@@ -352,6 +352,9 @@ class TrainConfig(
         """
         for name, each in FIELDS.items():
             each.require(getattr(self, name))
+        # A file may change, or be missing where the run is resumed.
+        text = read_disturbances(self.disturbances).to_json()
+        object.__setattr__(self, 'disturbances', '' if text == '{}' else text)
         for is_broken, reason in _rules(self, task_spec(self.task, control_hz=self.control_hz)):
             if is_broken:
                 raise ValueError(reason)
@@ -553,11 +556,10 @@ def _rules(config: TrainConfig, spec: TaskSpec) -> Iterator[tuple[bool, str]]:
     """Yield each rule between fields: whether it is broken, and its error message.
 
     Raises:
-        ValueError: If `goal_features` or `disturbances` is invalid.
+        ValueError: If `goal_features` is invalid.
     """
     c = config
     goal_features(c.goal_features, spec)
-    read_disturbances(c.disturbances)
     ppo, is_sparse = c.algorithm == 'ppo', c.reward_type == 'sparse'
     yield (
         not 1 <= len(c.hidden_sizes) <= 64 or not all(1 <= n <= MOST_UNITS for n in c.hidden_sizes),

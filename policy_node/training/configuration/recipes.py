@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Mapping
 from typing import Any
 
@@ -194,7 +193,7 @@ def _robust(task: str) -> dict[str, Any]:
     values = _shipped_networks(task) | {
         'algorithm': 'imitation',
         'init_from': task,
-        'disturbances': json.dumps(dataclasses.replace(scaled, action=action).as_dict()),
+        'disturbances': dataclasses.replace(scaled, action=action).to_json(),
         'disturbance_scales': in_turn,
         'past_actions': 4,
         'total_steps': 10_000 * task_spec(task).episode_ticks,

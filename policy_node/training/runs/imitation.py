@@ -8,7 +8,6 @@ policy learns to act ahead of latency; see docs/robust_policies.md.
 from __future__ import annotations
 
 import copy
-import json
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -63,7 +62,7 @@ class Answers:
 
 def _scaled(config: TrainConfig, scale: float) -> TrainConfig:
     scaled = read_disturbances(config.disturbances).scaled(scale)
-    return replace(config, disturbances=json.dumps(scaled.as_dict()))
+    return replace(config, disturbances=scaled.to_json())
 
 
 class ImitationTrainer(BaseTrainer):

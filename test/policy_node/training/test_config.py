@@ -81,6 +81,14 @@ def test_what_a_study_switches_is_on_the_page_with_a_request():
         assert re.match('[1-9]', request), field
 
 
+def test_a_configuration_contains_the_disturbances_of_a_file_and_not_its_path(tmp_path):
+    file = tmp_path / 'late.yaml'
+    file.write_text('action: {latency: 1}')
+    config = recipe_config('FetchReach', 'best', disturbances=str(file))
+    assert config.disturbances == '{"action": {"latency": [1, 1]}}'
+    assert recipe_config('FetchReach', 'best', disturbances='none').disturbances == ''
+
+
 def test_scalars_of_numpy_are_values_of_python():
     given = {
         'gamma': np.float64(0.9),
