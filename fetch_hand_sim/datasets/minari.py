@@ -172,6 +172,8 @@ def _environment(episode: EpisodeArrays) -> Any:
     spec = copy.deepcopy(gymnasium.spec(environment_id(episode.spec.name)))
     for name in ('reward_type', 'success_rule', 'control_hz'):
         spec.kwargs[name] = getattr(record, name)
+    if not record.disturbances.is_off:
+        spec.kwargs['disturbances'] = record.disturbances.as_dict()
     spec.max_episode_steps = episode.spec.episode_ticks
     return spec
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from fetch_hand_sim.episode_log import EpisodeDirectory, load_episodes
+from policy_node.training import generate_episodes
 from support.episode_recorder import Recorder
 from support.full_disk import files_at_most
 
@@ -73,6 +74,18 @@ def test_the_recovered_environment_has_episodes_as_long_as_those_logged(
     assert (warning in dataset.storage.metadata['description']) == (timing == 'ticks')
     environment = dataset.recover_environment()
     assert environment.spec.max_episode_steps == steps
+    environment.close()
+
+
+def test_the_recovered_environment_is_disturbed_as_the_robot_was(export, minari, tmp_path):
+    arguments = ['--policy', 'random', '--task', 'FetchReach', '--episodes', '1', '--threads', '1']
+    disturbed = ['--disturbances', 'mild', '--output', str(tmp_path / 'logged')]
+    assert generate_episodes.main([*arguments, *disturbed]) == 0
+    assert export(tmp_path / 'logged', 'minari', tmp_path / 'minari') == 0
+    environment = minari.load_dataset('FetchReach/logged-v0').recover_environment()
+    observation, _ = environment.reset(seed=0)
+    (logged,) = load_episodes(tmp_path / 'logged')
+    np.testing.assert_array_equal(observation['observation'], logged.observations['observation'][0])
     environment.close()
 
 
