@@ -2,9 +2,9 @@
 
     python -m policy_node.training.critic_bias runs/block
 
-A critic that overestimates values cannot show the actor which action is better. There are two
-causes. The actor prefers actions whose value is overestimated. Hindsight goals treat every outcome
-as intended (docs/her_and_recipes.md).
+A critic that overestimates values cannot show the actor which action is better. Values are
+overestimated for two reasons. The actor prefers actions whose value is overestimated, and hindsight
+goals treat every outcome as intended (docs/her_and_recipes.md).
 """
 
 from __future__ import annotations

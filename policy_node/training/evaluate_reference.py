@@ -53,8 +53,8 @@ def success_in_reference(
 ) -> int:
     """Run one episode per seed in Gymnasium-Robotics; return how many end in success.
 
-    Each episode of a hand task gets a new environment, because the reference carries state from one
-    episode to the next.
+    Each episode of a task with an object in the hand gets a new environment, because
+    Gymnasium-Robotics carries state over from one episode to the next.
 
     Args:
         reference_id: Environment of Gymnasium-Robotics, for example `FetchPush-v4`.
@@ -119,7 +119,7 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _report_to_add_to(file: Path | None) -> dict[str, Any]:
-    """Return the contents of the JSON file; empty if `file` is None or does not exist.
+    """Return the JSON object in `file`; empty if there is no such file.
 
     This is called before the long evaluation, so that an unusable file is found early.
 

@@ -26,20 +26,19 @@ _Z95 = 1.959963984540054
 
 @dataclass(frozen=True, slots=True)
 class EpisodeOutcomes:
-    """Outcomes of evaluated episodes, arrays (episodes,).
+    """Outcomes of evaluated episodes; each attribute is an array (episodes,).
 
     Attributes:
         seed: Seed of the episode.
-        success_gymnasium: Success at the last step, rule of the released code.
-        success_paper: Success at the last step, rule of the paper's text.
-        touched: Success (rule of the simulation) at any step.
+        success_gymnasium: Success at the last step, by the rule `gymnasium` of the released code.
+        success_paper: Success at the last step, by the rule in the text of the paper.
+        touched: Success at any step, by the success rule of the simulation.
         episode_return: Sum of the rewards.
         diverged: The simulation diverged; the episode counts as a failure.
-        ticks_reached: Number of ticks in success (rule of the simulation), without the last tick.
-        ticks_kept: Number of these ticks after which the next tick is in success too.
+        ticks_reached: Number of ticks with success (rule of the simulation), except the last tick.
+        ticks_kept: Number of these ticks that are followed by another tick with success.
         long_way: At the start, the quaternions of goal and object had opposite signs. The
-            `gymnasium` rule then requires the rotation by more than pi. False if the goal is no
-            pose.
+            `gymnasium` rule then requires a rotation by more than pi. False if the goal is no pose.
         dropped: The object was below the palm at the end; False if the goal is no pose.
         final_distance: Metres to the goal at the end; NaN if position does not count.
         final_rotation: Radians to the goal at the end; NaN if rotation does not count.
@@ -62,7 +61,7 @@ class EpisodeOutcomes:
         return len(self.seed)
 
     def join(self, other: EpisodeOutcomes) -> EpisodeOutcomes:
-        """Return the episodes of both, those of `other` last."""
+        """Return these episodes, followed by those of `other`."""
         names = EpisodeOutcomes.__slots__
         pairs = [(getattr(self, name), getattr(other, name)) for name in names]
         return EpisodeOutcomes(*(np.concatenate(pair) for pair in pairs))
@@ -90,18 +89,19 @@ def wilson_interval(successes: int, episodes: int) -> tuple[float, float]:
 def compare(
     first: EpisodeOutcomes, second: EpisodeOutcomes, success_rule: str = 'gymnasium'
 ) -> dict[str, Any]:
-    """Compare the success of two policies on the same episodes, ready for JSON.
+    """Compare the success of two policies on the same episodes; return JSON values.
 
     Args:
         first: Outcomes of one policy.
-        second: Outcomes of the other; compared are the episodes that both have.
+        second: Outcomes of the other policy, with the same seeds. If one of the two has more
+            episodes, its last ones are ignored.
         success_rule: `gymnasium` or `paper`.
 
     Returns:
         `episodes`: number of compared episodes. `difference`: success rate of the first minus that
-        of the second. `difference_interval_95`: its interval for pairs (Agresti and Min 2005, which
-        adds half an episode to each of the four outcomes). `only_first`, `only_second`: number of
-        episodes in which only one succeeds.
+        of the second. `difference_interval_95`: its 95 % interval for paired episodes (Agresti and
+        Min 2005, who add half an episode to each of the four outcomes). `only_first`,
+        `only_second`: number of episodes in which only this policy succeeds.
     """
     count = min(len(first), len(second))
     one, two = (getattr(each, f'success_{success_rule}')[:count] for each in (first, second))
@@ -119,7 +119,7 @@ def compare(
 
 
 def summarize(outcomes: EpisodeOutcomes) -> dict[str, Any]:
-    """Return success rates with 95 % intervals, mean return and `diagnose`, ready for JSON."""
+    """Return success rates with 95 % intervals, mean return and the measures of `diagnose`."""
     episodes = len(outcomes)
     summary: dict[str, Any] = {'episodes': episodes, 'first_seed': int(outcomes.seed[0])}
     for name in ('success_gymnasium', 'success_paper', 'touched'):
@@ -136,10 +136,10 @@ def diagnose(outcomes: EpisodeOutcomes) -> dict[str, float]:
 
     Returns:
         `stay`: probability of success at the next tick, given success at this one. `long_way`:
-        success rate of the episodes that require a rotation by more than pi; `long_way_share`:
+        success rate of the episodes that require a rotation by more than pi. `long_way_share`:
         share of these episodes. `dropped`: share of episodes that end with the object below the
-        palm. `distance`, `rotation`: medians at the end, metres and radians. Measures that do not
-        apply to the task or to any episode are missing.
+        palm. `distance`, `rotation`: median distance (m) and rotation (rad) to the goal at the end.
+        Measures that do not apply to the task or to any episode are missing.
     """
     found: dict[str, float] = {}
     if outcomes.ticks_reached.any():
@@ -159,8 +159,8 @@ def run_episodes(simulation: Simulation, policy: Policy, seeds: list[int]) -> Ep
     """Run one episode in each simulation, without noise, and return the outcomes.
 
     Args:
-        simulation: The simulations; both success rules are applied.
-        seeds: One per simulation; an episode depends on its seed alone.
+        simulation: The simulations. Success at the last step is computed by both success rules.
+        seeds: One seed per simulation. An episode does not depend on the others of the batch.
     """
     observation = simulation.reset(seed=seeds)
     count = simulation.num_envs
@@ -201,7 +201,7 @@ def run_episodes(simulation: Simulation, policy: Policy, seeds: list[int]) -> Ep
 
 
 def _long_way(spec: TaskSpec, observation: dict[str, NDArray[np.float64]]) -> NDArray[np.bool_]:
-    """Return (episodes,): True if goal and object have quaternions of opposite signs."""
+    """Return (episodes,): True if the quaternions of goal and object have opposite signs."""
     achieved, desired = observation['achieved_goal'], observation['desired_goal']
     if spec.goal is not GoalKind.POSE:
         return np.zeros(len(achieved), np.bool_)
@@ -219,7 +219,7 @@ def evaluate(
 
     Args:
         simulation: The simulations; the result does not depend on their number.
-        episodes: Number of episodes; without an early end, as many outcomes are returned.
+        episodes: Number of episodes to run, unless `hopeless` ends the evaluation early.
         hopeless: Called after each batch with all outcomes so far; True ends the evaluation early.
 
     Raises:
@@ -249,7 +249,7 @@ def training_seeds(sequence: np.random.SeedSequence, count: int) -> list[int]:
 
 
 def success_rate(outcomes: EpisodeOutcomes, success_rule: str) -> float:
-    """Return the share of episodes that succeed at the last step, by `gymnasium` or `paper`."""
+    """Return the success rate at the last step, by the rule `gymnasium` or `paper`."""
     return float(getattr(outcomes, f'success_{success_rule}').mean())
 
 
@@ -267,8 +267,8 @@ _NARROWEST = 60
 def print_table(report: dict[str, Any]) -> None:
     """Print the summary of an evaluation as a table, with 95 % intervals.
 
-    `report` is the result of `summarize` with the keys `task` and `policy`, and maybe
-    `disturbances` and `against` (the report of another policy with the result of `compare`).
+    `report` is the result of `summarize` with the additional keys `task` and `policy`. Optional
+    keys are `disturbances` and `against`: the other policy and the result of `compare`.
     """
     title = f'{report["task"]}: {report["policy"]}, {report["episodes"]} episodes'
     if 'disturbances' in report:

@@ -57,10 +57,10 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
 
 
 def make_generator(options: argparse.Namespace) -> tuple[EpisodeGenerator, Simulation]:
-    """Return a generator that runs the chosen policy and logs its episodes, and its simulation.
+    """Return an episode generator for the chosen policy, and the simulation that it steps.
 
     Raises:
-        UsageError: If the policy cannot be loaded, or an option does not fit it.
+        UsageError: If the policy cannot be loaded, or an option does not fit the policy.
     """
     loaded = load_chosen_policy(options)
     simulation = make_chosen_simulation(options, loaded)

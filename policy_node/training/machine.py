@@ -1,4 +1,4 @@
-"""The hardware of a run: device, processor, memory and threads; other workers of `torchrun`."""
+"""The hardware of a run (device, memory, threads) and communication between its workers."""
 
 from __future__ import annotations
 
@@ -43,9 +43,9 @@ def processor() -> str:
 def split_threads(config: TrainConfig) -> tuple[int, int]:
     """Return the number of simulation threads and the number of tensor threads of this worker.
 
-    Numbers that are 0 in the configuration share the worker's cores, because collecting and
-    learning may overlap. A second tensor thread gains 5 % at 3 x 256 and batch 1024, 80 % at 4096
-    (measured on 4 cores).
+    A number that is 0 in the configuration is chosen from the cores of this worker. If collecting
+    and learning overlap, they share these cores. For networks of 3 x 256 units, a second tensor
+    thread gains 5 % with batches of 1024 and 80 % with batches of 4096 (measured on 4 cores).
     """
     local_workers = int(os.environ.get('LOCAL_WORLD_SIZE', '1'))
     cores = max(len(os.sched_getaffinity(0)) // local_workers, 1)
@@ -56,7 +56,7 @@ def split_threads(config: TrainConfig) -> tuple[int, int]:
 
 
 def uses_bfloat16(precision: str, device: torch.device) -> bool:
-    """Return whether matrix products use bfloat16; for `auto`, whether the device supports it."""
+    """Return whether matrix products use bfloat16; `auto` uses it if the device supports it."""
     if precision != 'auto':
         return precision == 'bfloat16'
     if device.type == 'cuda':
@@ -65,7 +65,7 @@ def uses_bfloat16(precision: str, device: torch.device) -> bool:
 
 
 def choose_device(name: str) -> torch.device:
-    """Return the torch device for `cpu`, `cuda` or `auto`, a GPU if torch has one.
+    """Return the torch device for `cpu`, `cuda` or `auto` (a GPU if torch has one, else the CPU).
 
     With `torchrun`, each worker of a machine gets its own GPU.
 
@@ -81,7 +81,7 @@ def choose_device(name: str) -> torch.device:
 
 @dataclass(frozen=True, slots=True)
 class Workers:
-    """This worker and its connection to the other workers, the processes that train together.
+    """This worker process and its connection to the other workers of the run.
 
     Attributes:
         rank: Index of this worker; worker 0 writes logs and checkpoints.
@@ -138,7 +138,7 @@ class Workers:
             values.copy_(self.sum(values if self.is_first else torch.zeros_like(values)))
 
     def any(self, flag: bool) -> bool:
-        """Return whether `flag` is True on any worker. All must call this together."""
+        """Return whether `flag` is True on any worker. All workers must call this together."""
         return bool(self.sum(torch.tensor([float(flag)])).item() > 0)
 
 

@@ -51,7 +51,7 @@ def load_chosen_policy(options: argparse.Namespace) -> LoadedPolicy:
     """Load the policy that the options of `add_policy_options` choose.
 
     Raises:
-        UsageError: If `--policy` and `--task` are missing, or the policy cannot be loaded.
+        UsageError: If both `--policy` and `--task` are missing, or the policy cannot be loaded.
     """
     if not options.policy and options.task is None:
         raise UsageError(f'--policy is missing; allowed: {POLICY_NAMES}')
@@ -62,7 +62,7 @@ def load_chosen_policy(options: argparse.Namespace) -> LoadedPolicy:
 
 @contextmanager
 def policy_errors() -> Iterator[None]:
-    """Turn a `PolicyError` in the block into a `CommandError`: one line ends the command."""
+    """Turn a `PolicyError` in the block into a `CommandError`, which ends the command."""
     try:
         yield
     except PolicyError as error:

@@ -127,7 +127,7 @@ def train(
 
 @contextlib.contextmanager
 def _torch_restored() -> Iterator[None]:
-    """Restore torch's number of threads and random state of the calling program afterwards."""
+    """After the block, restore the number of threads and the random state of torch."""
     threads = torch.get_num_threads()
     try:
         with torch.random.fork_rng():

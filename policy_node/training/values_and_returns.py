@@ -49,8 +49,8 @@ class Comparison:
 def measure(run: Path, episodes: int) -> list[Comparison]:
     """Compare the critic's values with returns in new episodes of a run's actor, without noise.
 
-    `run` is the folder. The actor is the one that collects, not its average. There is one
-    comparison for each of a few ticks of the episodes.
+    `run` is the folder of the run. The actions are those of the actor that collects, not of the
+    averaged actor. The result has one comparison for each of a few ticks.
 
     Raises:
         ValueError: If the folder contains no run, or its critic returns no action values.
@@ -108,7 +108,7 @@ def _judge(
 def discounted(rewards: NDArray[np.float64], gamma: float) -> NDArray[np.float64]:
     """Return the discounted returns (ticks, episodes) from each tick on.
 
-    After the end of an episode, each reward is taken as the mean of its last ticks.
+    Rewards after the end of an episode are assumed to equal the mean of its last rewards.
     """
     following = rewards[-_LAST_TICKS:].mean(axis=0) / (1.0 - gamma)
     returns = np.empty_like(rewards)

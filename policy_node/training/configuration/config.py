@@ -1,7 +1,7 @@
 """The configuration of a training run: its fields in groups, and the rules between them.
 
-Each class before `TrainConfig` is a group of fields; `TrainConfig` inherits all groups. `flat.py`
-reads the values that users give.
+Each class above `TrainConfig` is one group of fields, and `TrainConfig` inherits all of them. The
+values that users set are parsed in `flat.py`.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ Count = Annotated[int, Range(0, 1024)]
 
 @dataclass(frozen=True, kw_only=True)
 class Start:
-    """Task, recipe, seed and algorithm."""
+    """Task, recipe, seed and algorithm of the run."""
 
     task: str
     """Task name, `FetchReach`, ..."""
@@ -62,7 +62,7 @@ class Start:
 
 @dataclass(frozen=True, kw_only=True)
 class Collect:
-    """Where episodes come from."""
+    """Collection of episodes in the simulation."""
 
     num_envs: Annotated[int, Range(1, 100_000)] = 64
     """Simulations stepped together; each cycle collects one episode of each."""
@@ -79,7 +79,7 @@ class Collect:
 
 @dataclass(frozen=True, kw_only=True)
 class Goals:
-    """Rewards, and goals that replace those of the episodes in a batch."""
+    """Rewards and hindsight goals."""
 
     reward_type: Literal['sparse', 'dense'] = 'sparse'
     """`sparse` (-1 until success, then 0) or `dense` (negative distance)."""
@@ -109,7 +109,7 @@ class Goals:
 
 @dataclass(frozen=True, kw_only=True)
 class Network:
-    """Actor and critic."""
+    """Networks of the actor and the critic."""
 
     hidden_sizes: tuple[int, ...] = (256, 256, 256)
     """Width of each hidden layer of actor and critic."""
@@ -127,7 +127,7 @@ class Network:
 
 @dataclass(frozen=True, kw_only=True)
 class Replay:
-    """Episodes to learn from."""
+    """Replay of the collected episodes."""
 
     replay_transitions: Annotated[int, Range(1)] = 1_000_000
     """Capacity of the replay."""
@@ -147,7 +147,7 @@ class Replay:
 
 @dataclass(frozen=True, kw_only=True)
 class Learner:
-    """Updates of the networks."""
+    """Gradient updates of the networks."""
 
     batch_size: Annotated[int, Range(1, 1_000_000)] = 1024
     """Transitions per update."""
@@ -185,7 +185,7 @@ class Learner:
 
 @dataclass(frozen=True, kw_only=True)
 class Exploration:
-    """Noise on collected actions."""
+    """Exploration noise while episodes are collected."""
 
     random_epsilon: Share = 0.3
     """Probability of a uniformly random action."""
@@ -202,7 +202,7 @@ class Exploration:
 
 @dataclass(frozen=True, kw_only=True)
 class Critics:
-    """Networks that values come from."""
+    """Number, normalisation and outputs of the critics."""
 
     critics: Annotated[int, Range(1, 100)] = 1
     """Critics that start differently; the actor follows their mean."""
@@ -218,7 +218,7 @@ class Critics:
 
 @dataclass(frozen=True, kw_only=True)
 class Values:
-    """Values that the critics learn."""
+    """Returns and values that the critics learn."""
 
     n_step: Annotated[int, Range(1, 100)] = 1
     """Most steps of a return before it bootstraps."""
@@ -247,7 +247,7 @@ class Values:
 
 @dataclass(frozen=True, kw_only=True)
 class Subgoals:
-    """Subgoals."""
+    """Imagined subgoals, and subgoals of a second, high level."""
 
     subgoal_prior: Annotated[float, Range(0)] = 0.0
     """Weight in the actor loss of the distance between its actions and those for an imagined
@@ -262,7 +262,7 @@ class Subgoals:
 
 @dataclass(frozen=True, kw_only=True)
 class Ppo:
-    """Proximal policy optimisation."""
+    """Initial networks of proximal policy optimisation (PPO)."""
 
     first_value: Annotated[float, Range(-1_000_000, 0)] = 0.0
     """Value that the critic of `ppo` starts with. With -1 / (1 - gamma), the value of failing for
@@ -274,7 +274,7 @@ class Ppo:
 
 @dataclass(frozen=True, kw_only=True)
 class Imitation:
-    """Imitation of the policy in `init_from` on true states (DAgger)."""
+    """Imitation of the policy in `init_from`, which observes the true state (DAgger)."""
 
     value_weight: Annotated[float, Range(0, 1000)] = 0.0
     """Weight of the value that an action loses against the action of the imitated policy, by its
@@ -334,11 +334,10 @@ class TrainConfig(
     Collect,
     Start,
 ):
-    """All settings of a training run, except its folder; equal on all workers.
+    """All settings of a training run except its folder. All workers have the same settings.
 
-    `num_envs`, `batch_size` and `replay_transitions` are totals: with N workers each takes its
-    share. So the `paper` recipe on 19 workers gives each worker the set-up of a worker in the
-    paper.
+    `num_envs`, `batch_size` and `replay_transitions` are totals, divided among the workers. With
+    19 workers, the `paper` recipe gives each worker the settings of one worker in the paper.
 
     Raises:
         ValueError: If a value is not allowed, or fields exclude each other.
@@ -361,7 +360,7 @@ class TrainConfig(
 
     @property
     def tick_share(self) -> float:
-        """Duration of a tick in units of `gamma`: 1, or with `discount` time its share of 40 ms."""
+        """Duration of a tick in units of `gamma`: 1, or tick / 40 ms with `discount=time`."""
         return DEFAULT_CONTROL_HZ / self.control_hz if self.discount == 'time' else 1.0
 
     @property
@@ -371,12 +370,12 @@ class TrainConfig(
 
     @property
     def lowest_value(self) -> float:
-        """Lowest possible value: the discounted return if each reward, before scaling, is -1."""
+        """Lowest possible value: the discounted return if every reward is -1 times `tick_share`."""
         return -self.tick_share / (1.0 - self.tick_gamma)
 
     @property
     def noise_ticks(self) -> int:
-        """Number of ticks before exploration noise is drawn again, at least 1."""
+        """Number of ticks for which exploration noise is held, at least 1."""
         return max(round(self.noise_seconds * self.control_hz), 1)
 
     @property
@@ -407,7 +406,7 @@ class Field:
     default: Any
 
     def require(self, value: Any) -> None:
-        """Raise ValueError if the type of the field does not allow a value."""
+        """Raise ValueError if `value` is outside the choices or limits of the field."""
         name, limits = self.name, self.limits
         if self.choices and value not in self.choices:
             raise ValueError(f'{name} {value!r:.80}; allowed: {", ".join(self.choices)}')
@@ -420,7 +419,7 @@ class Field:
 
 
 def _describe() -> Iterator[Field]:
-    """Yield all fields in the order of the groups; titles and meanings are read from the source."""
+    """Yield all fields, group by group; titles and meanings are the docstrings in this module."""
     hints = typing.get_type_hints(TrainConfig, include_extras=True)
     # The whole module is parsed once: for the source of one class, Python parses all of it.
     source = ast.parse(inspect.getsource(sys.modules[__name__]))
@@ -542,7 +541,7 @@ def changed_fields(config: TrainConfig, names: typing.Iterable[str]) -> list[str
 
 
 def unusual_networks(config: TrainConfig) -> list[str]:
-    """Return 'name value' for each changed field that makes networks of a special kind.
+    """Return 'name value' for each changed field that makes networks unfit for `init_from`.
 
     A run with such networks cannot use `init_from`, and no other run can start from them.
     """
@@ -553,7 +552,7 @@ def unusual_networks(config: TrainConfig) -> list[str]:
 
 
 def _rules(config: TrainConfig, spec: TaskSpec) -> Iterator[tuple[bool, str]]:
-    """Yield each rule between fields: whether it is broken, and its error message.
+    """Yield each rule between fields as a pair: whether it is broken, and the error message.
 
     Raises:
         ValueError: If `goal_features` is invalid.
@@ -636,7 +635,7 @@ def _rules(config: TrainConfig, spec: TaskSpec) -> Iterator[tuple[bool, str]]:
 
 
 def _rules_of_goals(config: TrainConfig) -> Iterator[tuple[bool, str]]:
-    """Yield each rule between the fields for goal sources, in the form of `_rules`."""
+    """Yield each rule between the fields for goal sources, as pairs like those of `_rules`."""
     c, goals, total = config, config.goals, sum(config.goals.values())
     unknown = ', '.join(map(repr, goals.keys() - set(SOURCES)))
     yield bool(unknown), f'goals {goals}: {unknown}; allowed: {", ".join(SOURCES)}'
@@ -673,13 +672,13 @@ _KEPT = 0.99
 
 
 def idle_parts(config: TrainConfig, critic_first: int = 0) -> Iterator[str]:
-    """Yield a warning for each part of learning that never happens with these values.
+    """Yield a warning for each part of training that has no effect with these values.
 
-    The checks: updates happen, the target networks move, and collected actions are not noise alone.
+    Examples: the run ends before its first update, or exploration noise replaces all actions.
 
     Args:
         config: Configuration of the whole run.
-        critic_first: Updates before the actor learns; it counts if it exceeds
+        critic_first: Updates of the critic before the actor learns, if more than
             `config.critic_first`.
     """
     c = config

@@ -58,11 +58,11 @@ def to_flat(config: TrainConfig) -> dict[str, Any]:
 
 
 def from_flat(fields: Mapping[str, Any], **changes: Any) -> TrainConfig:
-    """Build a configuration from fields by name; other fields get their default.
+    """Build a configuration from values by field name; missing fields get their default.
 
     Args:
-        fields: Fields of a recipe or a stored run. One without effect is set to its default.
-        **changes: Fields that the user gave, which replace those in `fields`.
+        fields: Values of a recipe or a stored run. The default replaces a value without effect.
+        **changes: Values set by the user, which replace those in `fields`.
 
     Raises:
         ValueError: If a field is unknown, a value is not allowed, fields exclude each other, or a
@@ -94,7 +94,7 @@ def changed(config: TrainConfig, **changes: Any) -> TrainConfig:
 def config_from_dict(values: Mapping[str, Any], **changes: Any) -> TrainConfig:
     """Rebuild the configuration of a stored run from JSON values.
 
-    Fields that are newer than the file get their default. Fields removed since are ignored;
+    Fields that the file lacks get their default. Fields that a later version removed are ignored;
     `removed_fields` returns them.
 
     Raises:
@@ -105,15 +105,15 @@ def config_from_dict(values: Mapping[str, Any], **changes: Any) -> TrainConfig:
 
 
 def removed_fields(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the fields of a stored run that version 2.0 removed, if they were not the default."""
+    """Return the values of a stored run for removed fields, except default values."""
     return {n: values[n] for n, default in REMOVED.items() if values.get(n, default) != default}
 
 
 def typed_fields(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return `values` with each value converted to the type of its field.
+    """Convert values, by name of a field of `TrainConfig`, to the types of these fields.
 
-    NumPy scalars become Python numbers, lists become tuples and whole numbers floats. The texts of
-    `goals` and `reward_grades` are parsed.
+    NumPy scalars become Python numbers, lists become tuples, and integers become floats in float
+    fields. Text for `goals` and `reward_grades` is parsed.
 
     Raises:
         ValueError: If a field is unknown or a value is not of its type.
@@ -150,7 +150,7 @@ def _type_name(kind: Any) -> str:
 
 
 def parse_assignment(text: str) -> tuple[str, Any]:
-    """Parse `name=value`; return the name of the field and the value in its type.
+    """Parse `name=value`; return the name of the field and the value, converted to its type.
 
     Raises:
         ValueError: If the field is unknown or the value does not fit its type.
@@ -168,7 +168,7 @@ def parse_value(name: str, text: str) -> Any:
     """Parse `text` into the type of the field `name`.
 
     Raises:
-        ValueError: If it does not fit the field's type.
+        ValueError: If `text` does not fit the type of the field.
     """
     kind = FIELDS[name].kind
     try:
@@ -196,10 +196,10 @@ def _parse(text: str, kind: Any) -> Any:
 
 
 def whole(text: str) -> int:
-    """Parse a whole number, also written as `1_000_000` or `1e6`.
+    """Parse an integer, which may be written as `1_000_000` or `1e6`.
 
     Raises:
-        ValueError: If it is not whole, or is written as a float above 2**53.
+        ValueError: If the number is not an integer, or is written as a float above 2**53.
     """
     try:
         return int(text)
@@ -224,11 +224,11 @@ def value_text(value: Any) -> str:
 def add_field_options(parser: argparse.ArgumentParser, without: tuple[str, ...]) -> None:
     """Add an option for each field to `parser`, for example `--learning-rate` for `learning_rate`.
 
-    An option that is not given is None. `--help` shows the fields by group, `--help-research` those
-    for studies.
+    Options that the user does not give are None. `--help` shows the options by group, except those
+    for studies, which `--help-research` shows.
 
     Args:
-        without: Fields without an option.
+        without: Names of fields that get no option.
     """
     research = argparse.ArgumentParser(
         prog=parser.prog, usage='fields for studies (docs/research)', add_help=False
@@ -250,7 +250,7 @@ def add_field_options(parser: argparse.ArgumentParser, without: tuple[str, ...])
 
 
 class _ResearchHelp(argparse.Action):
-    """Prints the page of fields for studies and exits."""
+    """Action of `--help-research`: print the options for studies and exit."""
 
     def __init__(self, *arguments: Any, page: argparse.ArgumentParser, **options: Any) -> None:
         super().__init__(*arguments, **{**options, 'nargs': 0})
@@ -287,12 +287,12 @@ def given_fields(options: argparse.Namespace) -> dict[str, Any]:
 def with_assignments(
     given: dict[str, Any], assignments: Iterable[str], options: Mapping[str, str] | None = None
 ) -> dict[str, Any]:
-    """Return the fields of options and of `--set` together.
+    """Return the values given by options and by `--set`, by field.
 
     Args:
         given: Fields given by options.
         assignments: Texts `name=value` of `--set`; the last one for a field counts.
-        options: Option of a field, for messages, if it is not its name with dashes.
+        options: Option names by field, for error messages; by default the field's name with dashes.
 
     Raises:
         ValueError: If an assignment is invalid or contradicts the option of its field.

@@ -24,7 +24,7 @@ _DECIDE_AT_RATES = (
 
 
 def ticks_of_40_ms(control_hz: float) -> float:
-    """Return the number of ticks in 40 ms, the step in which runs at all rates are measured."""
+    """Return the number of ticks in 40 ms, the unit of step counts that all rates share."""
     return control_hz / DEFAULT_CONTROL_HZ
 
 
@@ -60,11 +60,11 @@ def recipe_config(task: str, recipe: str, **overrides: Any) -> TrainConfig:
 
 
 def _at_rate(task: str, values: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the changes to `best` that keep the simulated time of a run equal at other rates.
+    """Return the changes to `best` for another action frequency, at equal simulated time.
 
-    At 25 Hz there are none. Above 25 Hz, learning also needs a discount by time, exploration noise
-    that lasts 40 ms and returns that span 40 ms (docs/research/rates), unless `overrides` decides
-    this.
+    At 25 Hz the result is empty. Above 25 Hz, it also sets a discount per 40 ms, exploration noise
+    that lasts 40 ms and n-step returns over 40 ms (docs/research/rates). These are left out if
+    `overrides` contains a field in `_DECIDE_AT_RATES`.
     """
     control_hz = overrides.get('control_hz', DEFAULT_CONTROL_HZ)
     if control_hz == DEFAULT_CONTROL_HZ:
@@ -81,7 +81,7 @@ def _at_rate(task: str, values: Mapping[str, Any], overrides: Mapping[str, Any])
 def _paper(task: str) -> dict[str, Any]:
     """Return the fields of the paper's appendix B and of `baselines/her/experiment/config.py`.
 
-    They are totals of 19 workers with 2 rollouts each.
+    Counts are totals of 19 workers with 2 rollouts each.
     """
     ticks = task_spec(task).episode_ticks
     epochs = 200 if ticks == 100 else 50
@@ -182,10 +182,11 @@ _EXACT = {'FetchSlide': (0.0, (1.0, 0.5)), 'FetchPickAndPlace': (1.0, (1.0, 1.0,
 
 
 def _robust(task: str) -> dict[str, Any]:
-    """Return the fields to imitate the shipped policy on a disturbed robot.
+    """Return the fields of the recipe `robust`, which imitates the shipped policy.
 
-    The disturbances are half of `hardware` with 0 to 2 ticks of latency. Tasks in `_EXACT` have
-    other scales, and the critic weighs errors of actions (docs/robust_policies.md).
+    The robot is disturbed by half of the preset `hardware`, with an action latency of 0 to 2
+    ticks. For tasks in `_EXACT` the scale differs, and a critic weights errors of actions
+    (docs/robust_policies.md).
     """
     scale, in_turn = _EXACT.get(task, (0.5, (1.0,)))
     scaled = PRESETS['hardware'].scaled(scale)
@@ -207,11 +208,12 @@ def _robust(task: str) -> dict[str, Any]:
 
 
 def _object_in_hand(task: str) -> dict[str, Any]:
-    """Return the fields for tasks with an object in the hand.
+    """Return the `best` fields for tasks with an object in the hand.
 
-    Third-party tasks whose name does not start with Fetch get them too. Each environment step is
-    followed by 51 samples, as in the paper. Nothing stays unmoved in a hand. Symmetry doubles the
-    speed of the egg; for the block it is not decided (docs/lab_notes/training_log.md).
+    They also apply to third-party tasks whose name does not start with Fetch. The learner draws 51
+    transitions for each environment step, as in the paper. `moved_share` is 0, because an object in
+    the hand always moves. Symmetric inputs halve the training time of the egg; for the block their
+    effect is not decided (docs/lab_notes/training_log.md).
     """
     spec = task_spec(task)
     return _FETCH | {
@@ -229,10 +231,10 @@ def _object_in_hand(task: str) -> dict[str, Any]:
 
 
 def _finetune(task: str) -> dict[str, Any]:
-    """Return the fields to train a shipped policy on, so that it holds the goals that it reaches.
+    """Return the fields of the recipe `finetune`: a shipped policy learns to hold reached goals.
 
-    Goals that do not depend on outcomes, a short horizon and a slow actor keep the critic from
-    overestimating values (docs/lab_notes/training_log.md).
+    Three settings keep the critic from overestimating values: goals that do not depend on outcomes,
+    a short horizon and rare updates of the actor (docs/lab_notes/training_log.md).
 
     Raises:
         ValueError: If the task has no object in the hand.
@@ -263,7 +265,7 @@ def _finetune(task: str) -> dict[str, Any]:
 
 
 def _shipped_networks(task: str) -> dict[str, Any]:
-    """Return the fields that give networks the sizes and inputs of the shipped ones of a task."""
+    """Return the fields that make networks with the sizes and inputs of a task's shipped actor."""
     best = _best(task)
     kept = ('layer_norm', 'goal_features')
     networks: dict[str, Any] = {name: best[name] for name in kept if name in best}

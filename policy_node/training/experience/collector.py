@@ -18,13 +18,13 @@ Observations = Mapping[str, ArrayLike]
 
 
 class ActionNoise:
-    """Adds exploration noise to actions: Gaussian, or a uniformly random action instead.
+    """Adds Gaussian noise to actions, or replaces actions by uniformly random ones.
 
     Args:
         shape: (simulations, action size).
         std: Standard deviation of the Gaussian noise; actions are in [-1, 1].
         epsilon: Probability that a simulation gets a random action.
-        ticks: Number of ticks before noise and random actions are drawn again.
+        ticks: Number of ticks for which noise and random actions are held.
 
     Attributes:
         share: Factor on `std` and `epsilon`, from 0 (no exploration) to 1.
@@ -49,7 +49,7 @@ class ActionNoise:
     def around(self, action: NDArray[Any], tick: int) -> Array32:
         """Return `action` (simulations, action size) with exploration noise, clipped to [-1, 1].
 
-        `tick` is the tick of the episode; tick 0 draws new noise.
+        `tick` counts the steps of the episode from 0; tick 0 draws new noise.
         """
         share = self.share
         if tick % self._ticks == 0:
@@ -62,7 +62,7 @@ class ActionNoise:
 
 
 class Collector:
-    """Runs all simulations through one episode at a time and records it.
+    """Runs one episode at a time in every simulation and records it.
 
     A collector has its own random generator and shares no state with the learner. So it can run in
     another thread and returns the same episodes for the same policy.
@@ -71,10 +71,10 @@ class Collector:
         seeds: One seed per simulation for its resets; the first also seeds exploration.
         extra_actions: Additional outputs of the policy. They are recorded, with noise, but not sent
             to the simulation.
-        extra_columns: Additional recorded columns of an action, which a subclass fills in.
+        extra_columns: Additional values recorded with each action, which a subclass fills in.
 
     Attributes:
-        exploration: Factor on all noise, 0 ... 1.
+        exploration: Factor on all exploration noise, 0 ... 1.
     """
 
     def __init__(
@@ -148,18 +148,18 @@ class Collector:
         return policy
 
     def _end(self, policy: Policy, acting: Policy, episodes: Episodes) -> None:
-        """Do nothing after the episodes; a subclass may adapt its noise here.
+        """Hook after the episodes, which does nothing here; a subclass may adapt its noise.
 
-        `policy` is the policy to explore around; `acting` is the one that acted, from `_begin`.
+        `policy` is the policy without noise; `acting` is the result of `_begin`, which acted.
         """
 
     def _explore(
         self, policy: Policy, observation: Observations, past: Array32, tick: int
     ) -> Array32:
-        """Return the noisy actions (simulations, columns) for one tick.
+        """Return the actions of one tick to record, with noise, (simulations, recorded columns).
 
-        `past` is the action history (simulations, past actions * action size), without columns if
-        the policy sees no past actions.
+        The first columns are the robot's actions. `past` contains the past actions, (simulations,
+        `past_actions` * action size).
         """
         return self._noise.around(self._predict(policy, observation, past), tick)
 

@@ -17,7 +17,7 @@ from policy_node.training.experience.replay import EpisodeReplay, Episodes
 
 
 def save_replay(path: Path, replay: EpisodeReplay, transitions: int) -> None:
-    """Write the newest episodes of a replay to a file, with `transitions` transitions or more.
+    """Write the newest episodes of a replay to a file, at least `transitions` transitions.
 
     A replay with fewer transitions is written completely.
 
@@ -29,10 +29,10 @@ def save_replay(path: Path, replay: EpisodeReplay, transitions: int) -> None:
 
 
 def load_replay(path: Path, replay: EpisodeReplay) -> None:
-    """Add the episodes of a file from `save_replay` to a replay, the newest ones if not all fit.
+    """Add episodes from a file of `save_replay` to a replay; if not all fit, add the newest.
 
     Raises:
-        ValueError: If the file cannot be read, is damaged or contains arrays of other sizes.
+        ValueError: If the file cannot be read, is damaged, or its arrays do not fit the replay.
     """
     try:
         tensors = load_file(path)
@@ -44,11 +44,11 @@ def load_replay(path: Path, replay: EpisodeReplay) -> None:
 
 
 def _require_whole(episodes: Episodes) -> None:
-    """Raise ValueError if episodes from a file are damaged.
+    """Check that episodes from a file are undamaged.
 
     Raises:
-        ValueError: If an array is not float32, has a value that is not finite, or the arrays differ
-            in their number of episodes.
+        ValueError: If an array is not float32 or not finite, or the arrays have different numbers
+            of episodes.
     """
     for name in Episodes.__slots__:
         array = getattr(episodes, name)
@@ -71,8 +71,8 @@ def read_experience(
         control_hz: Action frequency, Hz; episodes at other frequencies are skipped.
 
     Returns:
-        The usable episodes, and one line for each skipped one: damaged, of another task or
-        frequency, interrupted, or with a goal that changed on the way.
+        The usable episodes, and one line for each skipped episode. An episode is skipped if it is
+        damaged, interrupted, of another task or frequency, or if its goal changed.
 
     Raises:
         ValueError: If the directory has no usable episode.
@@ -95,7 +95,7 @@ def read_experience(
 
 
 def why_unusable(episode: EpisodeArrays, task: TaskSpec, control_hz: float) -> str:
-    """Return why the trainer cannot learn from an episode, '' if it can."""
+    """Return the reason why the trainer cannot learn from an episode, or '' if it can."""
     if episode.spec.name != task.name:
         return f'{episode.spec.name}, not {task.name}'
     if episode.record.control_hz != control_hz:

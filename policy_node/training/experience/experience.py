@@ -56,7 +56,7 @@ class RunningStatistics(nn.Module):
         self.total_square += added[1 + size :]
 
     def write(self, normalizer: Normalizer) -> None:
-        """Set mean and standard deviation of the normalizer; do nothing before any `update`."""
+        """Set mean and deviation of the normalizer; do nothing before the first `update`."""
         if not self.count:
             return
         mean = self.total / self.count
@@ -72,7 +72,7 @@ class Experience:
 
     Args:
         config: The configuration; `replay_transitions` and `batch_size` are totals of all workers.
-        extra_columns: Recorded columns of an action beside the robot's action.
+        extra_columns: Number of values recorded with each action beside the robot's action.
         weigh: Function that returns the weight of each episode. The share `moved_share` of a batch
             is drawn by these weights.
     """
@@ -136,13 +136,13 @@ class Experience:
             self.statistics[name].write(normalizer)
 
     def narrow(self, progress: float) -> None:
-        """Use the reward for this progress of the run, 0 ... 1; its thresholds may narrow."""
+        """Set the reward thresholds to those at `progress`, the finished share of the run."""
         self._sampler = self._sampler.at(progress)
 
     def batch(self, env_steps: int) -> Transitions:
         """Draw the transitions for one update and relabel their goals.
 
-        `env_steps`, the environment steps so far, matters only in subclasses.
+        `env_steps` is the number of environment steps so far. Only subclasses use it.
         """
         del env_steps
         return self._draw(self.mixture())
@@ -150,7 +150,7 @@ class Experience:
     def _draw(
         self, mixture: dict[str, float], sampler: TransitionSampler | None = None
     ) -> Transitions:
-        """Draw a batch, with another sampler than the experience's own if one is given."""
+        """Draw a batch with `sampler`, by default with the sampler of this experience."""
         chosen, replay = sampler or self._sampler, self.replay
         row = self._draw_rows()
         return chosen.sample(replay.episodes, row, mixture, self.generator, replay.valid_ticks)
@@ -168,10 +168,10 @@ class Experience:
 def ticks_until_dropped(
     spec: TaskSpec, more: int
 ) -> Callable[[Episodes], NDArray[np.int64]] | None:
-    """Return a function that counts how many ticks of each episode to learn from, (episodes,).
+    """Return a function that returns how many ticks of each episode to learn from, (episodes,).
 
-    An episode counts until `more` ticks after the object dropped: its centre is below the palm.
-    Return None, which means all ticks, if the task has no object in a hand or `more` is negative.
+    They end `more` ticks after the centre of the object fell below the palm. Return None, which
+    means all ticks, if the task has no object in a hand or `more` is negative.
     """
     if spec.goal is not GoalKind.POSE or more < 0:
         return None

@@ -5,7 +5,7 @@ Andrychowicz et al. 2017, "Hindsight Experience Replay" (arXiv 1707.01495). The 
 mixture is from Pitis et al. 2020 (arXiv 2007.02832).
 
 A new source of goals needs a function in `SOURCES` and its name in `configuration.config.SOURCES`.
-A new strategy is such a source that is also a value of the field `strategy` there.
+To make it a strategy, also add its name to the field `strategy` there.
 """
 
 from __future__ import annotations
@@ -31,9 +31,10 @@ def goal_mixture(strategy: str, k: int = 4, goals: Mapping[str, float] = {}) -> 
     """Return the probability of each goal source; they add up to 1.
 
     Args:
-        strategy: `none`, `final`, `future`, `episode`, `random`: k relabelled goals for each real
-            one. `futureactual`: k/2 future goals, k/2 desired goals of other episodes, 1 real goal.
-        k: Number of relabelled goals for each real one.
+        strategy: `final`, `future`, `episode` and `random` relabel k goals for each goal kept.
+            `futureactual` draws k/2 future goals and k/2 desired goals of other episodes for each
+            goal kept. `none` keeps all goals.
+        k: Number of relabelled goals for each goal kept.
         goals: Probability of each source, instead of `strategy` and `k`. If they add up to less
             than 1, the rest is `real`: transitions keep the goal of their episode.
     """
@@ -53,7 +54,8 @@ def draw_sources(
 ) -> NDArray[np.intp]:
     """Draw a goal source for each of `count` transitions.
 
-    `mixture` maps each source to its probability. The result, (count,), contains positions in it.
+    `mixture` maps each source to its probability. The result, (count,), contains indices of its
+    keys.
     """
     bounds = np.cumsum(list(mixture.values()))
     return np.searchsorted(bounds / bounds[-1], generator.random(count), side='right')
@@ -115,8 +117,8 @@ def _displaced(starts: Starts, generator: np.random.Generator) -> Array32:
     """Return goals near the goal achieved at the start of each transition.
 
     The displacement is a motion between two states of a random episode, at most ten ticks apart.
-    It is independent of the transition. `future` goals depend on where the transition led: where
-    contacts make this random, their values are too high.
+    It is independent of the transition. In contrast, `future` goals depend on where the transition
+    led, so values are overestimated where contacts make this random.
     """
     episodes, count = starts.episodes, len(starts.row)
     row = generator.integers(len(episodes), size=count)
@@ -140,7 +142,7 @@ SOURCES: dict[str, Source] = {
 
 
 def displace(here: Array32, before: Array32, after: Array32) -> Array32:
-    """Move the goals `here` as the goals `before` moved to `after`; each is (batch, goal_size).
+    """Move the goals `here` by the motion from `before` to `after`; all are (batch, goal_size).
 
     Poses are also turned by the rotation from `before` to `after`.
     """
@@ -152,7 +154,7 @@ def displace(here: Array32, before: Array32, after: Array32) -> Array32:
 
 
 def _achieved(starts: Starts, state: NDArray[np.int64]) -> Array32:
-    """Return the goals (batch, goal_size) achieved at the ticks `state` of these episodes."""
+    """Return the goal achieved at tick `state` of each transition's episode, (batch, goal_size)."""
     achieved = flat(starts.episodes.achieved_goal)
     return achieved.take(starts.row * (starts.episodes.ticks + 1) + state, axis=0)
 

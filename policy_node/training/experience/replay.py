@@ -1,4 +1,4 @@
-"""Replay of whole episodes, and batches of transitions. Hindsight needs whole episodes."""
+"""Replay of whole episodes, which hindsight needs, and batches of transitions."""
 
 from __future__ import annotations
 
@@ -55,17 +55,17 @@ Weigh = Callable[[Episodes], NDArray[np.float64]]
 class EpisodeReplay:
     """Ring buffer of the newest episodes, in arrays that are allocated once.
 
-    Linux maps the memory only as episodes fill it.
+    Linux provides the memory only when episodes fill it.
 
     Args:
         capacity: Largest number of episodes.
         ticks: Steps per episode.
         weigh: Function that returns the weight of each episode for `draw`; None is `has_moved`.
-        count_ticks: Function that returns how many ticks of each episode, from its first, may be
-            drawn; None allows all.
+        count_ticks: Function that returns the number of valid ticks at the start of each episode.
+            Only these are drawn. None makes all ticks valid.
 
     Attributes:
-        last_added: Number of episodes in the last call of `add`.
+        last_added: Number of episodes that the last call of `add` stored.
     """
 
     def __init__(
@@ -125,7 +125,7 @@ class EpisodeReplay:
         """Store episodes; a full replay overwrites its oldest ones.
 
         Raises:
-            ValueError: If there are more than `capacity` or their arrays have other sizes.
+            ValueError: If there are more than `capacity` episodes, or their sizes do not fit.
         """
         for name in Episodes.__slots__:
             given, held = getattr(episodes, name).shape[1:], getattr(self._ring, name).shape[1:]
@@ -148,7 +148,7 @@ class EpisodeReplay:
 
     @property
     def valid_ticks(self) -> NDArray[np.int64] | None:
-        """How many ticks of each stored episode, from its first, may be drawn; None if all."""
+        """Number of valid ticks at the start of each stored episode; None if all are valid."""
         return None if self._count_ticks is None else self._valid[: self._size]
 
     def draw(
@@ -200,8 +200,8 @@ class Starts:
         episodes: The episodes from which the transitions are drawn.
         row: Row number of the episode of each transition, (batch,).
         tick: Tick of the first state of each transition, (batch,).
-        valid_ticks: How many ticks of each episode, from its first, may be used, (episodes,); None
-            for all.
+        valid_ticks: Number of valid ticks at the start of each episode, (episodes,); None if all
+            ticks are valid.
     """
 
     episodes: Episodes

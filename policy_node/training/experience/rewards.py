@@ -1,4 +1,4 @@
-"""Rewards for training: the reward of the task, also with wider or several success thresholds."""
+"""Rewards for training: those of the task, or variants with wider or several thresholds."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ Values = NDArray[np.float64]
 class GradedReward:
     """A reward between -1 and 0 that rises with the number of thresholds met.
 
-    It is the share of distance thresholds met, times the share of rotation thresholds met if the
-    goal has a rotation, minus 1. The sparse reward does not show how nearly a goal was missed or
-    how safely it was met. With the sparse reward, an actor holds an object no better than the
-    threshold needs. If goals have a position and a rotation, the actor forgets one of them as long
-    as it never meets both.
+    The reward is the share of distance thresholds met, minus 1. If the goal has a rotation, this
+    share is multiplied by that of the rotation thresholds. The sparse reward does not show how
+    nearly a goal was missed or how safely it was met. With it, an actor holds an object no better
+    than the threshold requires. If goals have a position and a rotation, the actor neglects one of
+    them as long as it never meets both.
 
     Attributes:
         metric: Distance and rotation to the goal, and the success thresholds.
@@ -51,7 +51,7 @@ def reward_schedule(config: TrainConfig, metric: GoalMetric) -> Callable[[float]
     """Return a function from the progress of a run, 0 ... 1, to the reward function to use then.
 
     Raises:
-        ValueError: If `reward_grades` would replace the reward of a third-party task.
+        ValueError: If `reward_grades` is set for a third-party task that defines its own reward.
     """
     if metric.has_own_reward and config.reward_grades:
         raise ValueError(

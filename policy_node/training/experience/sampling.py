@@ -36,10 +36,10 @@ class TransitionSampler:
         gamma: Discount per tick.
         most_steps: Longest n-step return; 1 for single transitions.
         reward_scale: Factor on all rewards.
-        lost_value: Value of the state after the last valid tick of an episode that is cut there;
-            None bootstraps as usual.
-        reward_at: Progress of the run, 0 ... 1 -> `compute_reward` at that time; None if it never
-            changes.
+        lost_value: Value of the last valid state of an episode that is cut after a drop; None uses
+            the value of the critic.
+        reward_at: Function from the progress of the run, 0 ... 1, to `compute_reward` at that time;
+            None if the reward never changes.
         sources: Functions that draw goals, by name of the goal source.
     """
 
@@ -52,7 +52,7 @@ class TransitionSampler:
     sources: Mapping[str, Source] = field(default_factory=lambda: SOURCES)
 
     def at(self, progress: float) -> TransitionSampler:
-        """Return a sampler with the reward for this progress of the run, 0 ... 1."""
+        """Return a sampler with the reward at `progress`, the finished share of the run."""
         if self.reward_at is None:
             return self
         return replace(self, compute_reward=self.reward_at(progress))
@@ -70,8 +70,8 @@ class TransitionSampler:
         Args:
             row: Row number of the episode for each transition, (batch,).
             mixture: Probability of each goal source; they add up to 1.
-            valid_ticks: How many ticks of each episode, from its first, may be drawn, (episodes,);
-                None for all.
+            valid_ticks: Number of valid ticks at the start of each episode, (episodes,). Only these
+                are drawn. None makes all ticks valid.
         """
         if valid_ticks is None:
             tick = generator.integers(episodes.ticks, size=len(row))
@@ -97,7 +97,7 @@ class TransitionSampler:
     ) -> NDArray[np.int64]:
         """Return the length of each n-step return in steps, (batch,).
 
-        It is `most_steps`, or less if the valid states end before. Subclasses also use `goal` and
+        It is `most_steps`, or less if the valid ticks end before. Only subclasses use `goal` and
         `generator`.
         """
         del goal, generator
@@ -146,7 +146,8 @@ class TransitionSampler:
     ) -> Transitions:
         """Return n-step transitions of the lengths `steps`, (batch,), with discounted rewards.
 
-        `reward_after` returns the rewards for achieved goals and the indices of their transitions.
+        `reward_after(achieved, indices)` returns rewards for achieved goals of the transitions with
+        these indices.
         """
         episodes, row, tick = starts.episodes, starts.row, starts.tick
         total = np.zeros(len(steps))
@@ -168,7 +169,7 @@ def sampler_fields(config: TrainConfig, metric: GoalMetric) -> dict[str, Any]:
     """Return the arguments of `TransitionSampler` that follow from a configuration, by name.
 
     Raises:
-        ValueError: If `reward_grades` would replace the reward of a third-party task.
+        ValueError: If `reward_grades` is set for a third-party task that defines its own reward.
     """
     reward_at = reward_schedule(config, metric)
     return {

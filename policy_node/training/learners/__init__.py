@@ -1,1 +1,1 @@
-"""The base class of learners, DDPG, and DDPG with imagined subgoals; more are in `research`."""
+"""Learners: their base class, DDPG, and DDPG with imagined subgoals; more are in `research`."""

@@ -23,8 +23,8 @@ from policy_node.training.machine import Workers
 class Losses:
     """Losses and mean value of one update.
 
-    They are tensors on the device of the networks: reading them as numbers would wait for the
-    device.
+    They stay tensors on the device of the networks, because a conversion to numbers would wait for
+    the device.
     """
 
     critic: Tensor
@@ -121,7 +121,7 @@ class ActorCritic:
         }
 
     def set_progress(self, progress: float) -> None:
-        """Set the learning rate of both networks for this progress of the run."""
+        """Set the learning rates of actor and critic at `progress`, the share of the run done."""
         for optimizer in (self.actor_optimizer, self.critic_optimizer):
             set_learning_rate(optimizer, self.config, progress)
 
@@ -131,7 +131,7 @@ class ActorCritic:
 
 
 def set_learning_rate(optimizer: torch.optim.Adam, config: TrainConfig, progress: float) -> None:
-    """Set the learning rate for this progress of the run; `progress` is clipped to 0 ... 1."""
+    """Set the learning rate at `progress`, the finished share of the run, clipped to 0 ... 1."""
     share = min(max(progress, 0.0), 1.0)
     rate = config.learning_rate * (1.0 - share * (1.0 - config.final_learning_rate))
     optimizer.param_groups[0]['lr'] = rate
@@ -157,7 +157,7 @@ def network_shape(config: TrainConfig, extra_actions: int = 0) -> NetworkShape:
 def with_inputs(tensors: dict[str, Tensor], column: int, count: int) -> dict[str, Tensor]:
     """Insert `count` inputs at index `column` into the first layers of saved networks.
 
-    `tensors` are the networks by parameter name. The new weights are zero, so outputs do not
+    `tensors` contains the weights by parameter name. The new weights are zero, so outputs do not
     change.
     """
     changed = {}

@@ -25,8 +25,8 @@ _ALWAYS = ('observation', 'next_observation', 'goal', 'action', 'reward', 'disco
 class TensorBatch:
     """A batch as tensors on the device of the networks.
 
-    `features` and `next_features` are the network inputs from observation, or next observation, and
-    goal.
+    `features` are the network inputs made from `observation` and `goal`, and `next_features` those
+    made from `next_observation` and `goal`.
     """
 
     observation: Tensor
@@ -44,7 +44,7 @@ class Critic(nn.Module):
 
     Args:
         inputs: Number of features plus action size.
-        shape: Shape of the actor; the hidden layers are the same.
+        shape: Shape of the actor; the critic has the same hidden layers.
         outputs: Number of outputs, whose mean is the value.
     """
 
@@ -64,9 +64,9 @@ class Critic(nn.Module):
 
 
 class CriticLoss:
-    """Makes the critic and computes its loss: one critic, squared errors.
+    """Creates one critic and computes its squared errors.
 
-    Studies replace this class (`research/critics.py`).
+    Studies replace this class by those in `research/critics.py`.
     """
 
     def make(self, features: int, shape: NetworkShape) -> nn.Module:
@@ -99,7 +99,7 @@ class DDPG(ActorCritic):
 
     Args:
         workers: Processes that train together; gradients are averaged over them.
-        critic_loss: Critic and its loss; None takes those of the paper.
+        critic_loss: Creates the critic and computes its loss; None uses `CriticLoss`, as the paper.
     """
 
     def __init__(
@@ -126,7 +126,7 @@ class DDPG(ActorCritic):
         self._set_up(shape)
 
     def _set_up(self, shape: NetworkShape) -> None:
-        """Do nothing; a subclass creates its additional networks here, at the end of `__init__`."""
+        """Hook at the end of `__init__`, where subclasses create additional networks."""
 
     def _make_networks(self, shape: NetworkShape) -> tuple[Actor, nn.Module]:
         return Actor(shape), self.critic_loss.make(shape.feature_size, shape)
@@ -134,7 +134,7 @@ class DDPG(ActorCritic):
     def update(self, batch: Transitions) -> Losses:
         """Update the critic; update the actor and the target networks at their intervals.
 
-        Return the losses; the actor's loss and value come from its last update.
+        The returned loss and value of the actor come from its last update.
         """
         tensors = self.tensors(batch)
         critic_loss = self._update_critic(tensors)
@@ -147,14 +147,14 @@ class DDPG(ActorCritic):
 
     @torch.no_grad()
     def _move_targets(self) -> None:
-        """Move the target networks towards the networks by the share 1 - `polyak`."""
+        """Move the target networks towards the learning networks by the share 1 - `polyak`."""
         weight = 1.0 - self.config.polyak
         old: list[Tensor] = [*self.target_actor.parameters(), *self.target_critic.parameters()]
         new: list[Tensor] = [*self.actor_parameters, *self.critic_parameters]
         torch._foreach_lerp_(old, new, weight)
 
     def tensors(self, batch: Transitions) -> TensorBatch:
-        """Convert a batch to tensors and compute the network inputs of both states."""
+        """Convert a batch to tensors; compute network inputs before and after each transition."""
         observation, next_observation, goal, action, reward, discount = (
             self.tensor(getattr(batch, name)) for name in _ALWAYS
         )
@@ -180,7 +180,7 @@ class DDPG(ActorCritic):
         return self.clipped(reward + discount * self.critic_loss.pooled(next_value))
 
     def clipped(self, target: Tensor) -> Tensor:
-        """Return targets clipped to the possible returns if all rewards are in [-1, 0]."""
+        """Return targets clipped to the range of returns that rewards in [-1, 0] can have."""
         return target.clamp(self.config.lowest_value, 0.0)
 
     def _update_critic(self, batch: TensorBatch) -> Tensor:
@@ -228,5 +228,5 @@ class DDPG(ActorCritic):
         return super().modules() | (targets if self._has_targets else {})
 
     def precision(self) -> contextlib.AbstractContextManager[None]:
-        """Return a context in which matrix products use bfloat16 if the run does."""
+        """Return a context in which matrix products use bfloat16, if the run uses it."""
         return torch.autocast(self.device.type, torch.bfloat16, enabled=self._bfloat16)

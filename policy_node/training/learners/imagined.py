@@ -32,10 +32,10 @@ _TEMPERATURE = 1.0
 
 
 class ImaginingDDPG(DDPG):
-    """`DDPG` whose actor is drawn towards its actions for imagined subgoals. Arguments as `DDPG`.
+    """`DDPG` that pulls the actor towards its own actions for imagined subgoals.
 
     Attributes:
-        imagination: Network from the features of a state and its goal to a normalized subgoal.
+        imagination: Network that maps the features of a state and a goal to a normalized subgoal.
     """
 
     def _set_up(self, shape: NetworkShape) -> None:
@@ -84,7 +84,7 @@ class ImaginingDDPG(DDPG):
         return value if value.ndim == 1 else value.mean(dim=0)
 
     def _penalty(self, batch: TensorBatch, action: Tensor) -> Tensor:
-        """Return the action cost of `DDPG` plus a cost of the distance to actions for subgoals."""
+        """Return the penalty of `DDPG` plus the weighted distance to the actions for subgoals."""
         with torch.no_grad():
             features = self.actor.features(batch.observation, self.imagine(batch.features))
             prior = torch.tanh(self.target_actor(features))
