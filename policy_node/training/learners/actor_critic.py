@@ -121,7 +121,7 @@ class ActorCritic:
         }
 
     def set_progress(self, progress: float) -> None:
-        """Set the learning rates of actor and critic at `progress`, the share of the run done."""
+        """Set both learning rates to those at `progress`, the finished share of the run."""
         for optimizer in (self.actor_optimizer, self.critic_optimizer):
             set_learning_rate(optimizer, self.config, progress)
 

@@ -1,1 +1,1 @@
-"""Code that only studies use; other folders import only `registry.py`, which chooses it."""
+"""Code that only studies use. Other folders import only `registry.py`, which selects it."""

@@ -1,8 +1,8 @@
-"""Values with one more input: the success threshold, or the number of steps left.
+"""Networks with a condition as additional input: the success threshold or the steps left.
 
-Each transition is learned from with a random value of that input, as with a goal in hindsight. The
-actor acts at a fixed value of it. So the saved actor is an ordinary one: the input is a constant
-whose column is added to the bias of the first layer.
+Each transition of a batch gets a random condition, as it gets a random goal in hindsight. The actor
+always acts with the same condition. So the saved actor has the usual inputs: the constant condition
+becomes part of the bias of the first layer.
 """
 
 from __future__ import annotations
@@ -36,16 +36,17 @@ _ACTING = {'threshold': 0.0, 'horizon': 1.0}
 
 
 def acting_input(config: TrainConfig) -> float | None:
-    """Return the input at which the actor acts; None without a condition."""
+    """Return the condition with which the actor acts; None if networks have no condition."""
     return _ACTING.get(config.condition)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ConditionedTransitions(Transitions):
-    """A batch with conditions.
+    """A batch with a condition for each transition.
 
     Attributes:
-        condition: Input of the networks, (batch, 1).
+        condition: Additional network input for `observation`, (batch, 1).
+        next_condition: Additional network input for `next_observation`, (batch, 1).
     """
 
     condition: Array32
@@ -63,7 +64,7 @@ class ThresholdSampler(TransitionSampler):
         widest: Largest multiple.
 
     Raises:
-        ValueError: If it would replace the own reward of a third-party task.
+        ValueError: If a third-party task defines its own reward.
     """
 
     metric: GoalMetric
@@ -83,7 +84,7 @@ class ThresholdSampler(TransitionSampler):
         goal: Array32,
         generator: np.random.Generator,
     ) -> ConditionedTransitions:
-        """Return transitions; the condition is the logarithm of the drawn multiple."""
+        """Return transitions whose condition is the logarithm of the drawn multiple."""
         low, high = np.log(SMALLEST_THRESHOLD), np.log(self.widest)
         drawn = np.exp(generator.uniform(low, high, len(starts.row)))
         spec = self.metric.spec
@@ -103,10 +104,10 @@ class ThresholdSampler(TransitionSampler):
 
 @dataclass(frozen=True, kw_only=True)
 class HorizonSampler(TransitionSampler):
-    """Draws how many steps are left; a value sums that many rewards (TDM, arXiv 1802.09081).
+    """Draws how many steps are left; values are the returns of these (TDM, arXiv 1802.09081).
 
     Attributes:
-        ticks: Length of an episode; conditions are shares of it.
+        ticks: Length of an episode. The condition is the number of steps left, divided by it.
     """
 
     ticks: int
@@ -118,7 +119,7 @@ class HorizonSampler(TransitionSampler):
         goal: Array32,
         generator: np.random.Generator,
     ) -> ConditionedTransitions:
-        """Return transitions; the condition is the share of steps left, drawn uniformly.
+        """Return transitions whose condition, the share of steps left, is drawn uniformly.
 
         The discount is 0 where no step is left after the transition.
         """
@@ -180,7 +181,7 @@ def fold(network: MLP, shape: NetworkShape, value: float) -> MLP:
 
 
 def without_input(tensors: dict[str, Tensor], column: int, value: float) -> dict[str, Tensor]:
-    """Return tensors of networks without the input `column`, which is fixed at `value`."""
+    """Return the tensors of networks without input `column`, as if it always were `value`."""
     changed = {}
     for name in first_weights(tensors):
         weight, bias = tensors[name], name.removesuffix('weight') + 'bias'

@@ -1,4 +1,4 @@
-"""Other critics: ensembles, quantiles, batch normalization, advantages."""
+"""Critics for studies: ensembles, quantiles, batch normalization and advantages."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ AGGREGATES: dict[str, Aggregate] = {
 
 
 class Ensemble(nn.Module):
-    """Two or more critics that start differently and learn the same."""
+    """Two or more critics with different initial weights and the same targets."""
 
     def __init__(self, members: list[Critic]) -> None:
         super().__init__()
@@ -57,7 +57,7 @@ class Ensemble(nn.Module):
 
 
 def members_of(tensors: dict[str, Tensor]) -> list[dict[str, Tensor]]:
-    """Return the tensors of each critic, from those of a `Critic` or an `Ensemble`."""
+    """Split the tensors of a `Critic` or an `Ensemble` into those of each critic."""
     members: dict[int, dict[str, Tensor]] = {}
     for name, value in tensors.items():
         found = _MEMBER.fullmatch(name)
@@ -67,14 +67,14 @@ def members_of(tensors: dict[str, Tensor]) -> list[dict[str, Tensor]]:
 
 
 def as_one(members: list[dict[str, Tensor]], critics: int) -> dict[str, Tensor]:
-    """Return the tensors of members, named as in a learner of one critic or of several."""
+    """Merge the tensors of critics, with the names that a learner with `critics` critics uses."""
     if critics == 1:
         return members[0]
     return {f'members.{i}.{n}': value for i, m in enumerate(members) for n, value in m.items()}
 
 
 class EnsembleLoss(CriticLoss):
-    """One or more critics, perhaps with a layer normalization, and their squared errors."""
+    """Creates one or more critics, optionally with LayerNorm; computes their squared errors."""
 
     def __init__(self, options: Critics) -> None:
         self.options = options
@@ -97,8 +97,8 @@ class EnsembleLoss(CriticLoss):
 class QuantileLoss(EnsembleLoss):
     """Quantile regression as in QR-DQN (Dabney et al. 2018, arXiv 1710.10044).
 
-    If `truncated`, targets leave out the highest quantiles of all critics, as TQC (Kuznetsov
-    et al. 2020, arXiv 2005.04269).
+    With `aggregate=truncated`, targets leave out the highest quantiles of all critics, as in TQC
+    (Kuznetsov et al. 2020, arXiv 2005.04269).
     """
 
     def costs(self, learner: DDPG, batch: TensorBatch) -> Tensor:
@@ -119,7 +119,7 @@ def sample_of(quantiles: Tensor, truncated: bool) -> Tensor:
 
     Args:
         quantiles: (critics, batch, count), or (batch, count) of one critic.
-        truncated: Whether the highest are left out.
+        truncated: Whether the highest quantiles are left out.
     """
     if quantiles.ndim == 2:
         quantiles = quantiles[None]
@@ -187,26 +187,26 @@ def _add_batch_norm(network: MLP) -> None:
 
 
 def hidden_layers(shape: NetworkShape, norm: str) -> NetworkShape:
-    """Return the shape of a critic's hidden layers; `layer` adds a LayerNorm."""
+    """Return `shape`, with LayerNorm in the hidden layers if `norm` is `layer`."""
     return replace(shape, layer_norm=True) if norm == 'layer' else shape
 
 
 def critic_loss(options: Critics) -> CriticLoss:
-    """Return the loss that the options select."""
+    """Return the critic loss that the fields of the configuration select."""
     if options.quantiles > 1:
         return QuantileLoss(options)
     return BatchNormLoss(options) if options.norm == 'batch' else EnsembleLoss(options)
 
 
 class AdvantageCritic(nn.Module):
-    """Value of a state and advantage of an action, two networks (DAU, arXiv 1901.09732).
+    """Two networks: the value of a state and the advantage of an action (DAU, arXiv 1901.09732).
 
     The more frequent actions are, the less one of them matters. Action values become values of
     states, and the gradient of the actor vanishes. Here Q(s, a) = V(s) + dt (A(s, a) -
     A(s, pi(s))). A keeps its size at any dt, and the actor maximizes A.
 
     Args:
-        shape: Shape of the actor; the hidden layers are the same.
+        shape: Shape of the actor; both networks have the same hidden layers.
         duration: Duration dt of a tick in units of 40 ms.
     """
 

@@ -12,9 +12,10 @@ a critic of two goals. Here two classifiers learn them: each separates the goals
 same goals shuffled. At its optimum the logit is log q(g|...) / q(g) (noise-contrastive estimation,
 Gutmann & Hyvarinen 2010), so w is the exponential of the difference of two logits.
 
-A weight is finite only if goals that do not depend on s' are drawn as well: those of the episode
-itself or of other episodes (`actual`). q is the mixture of all sources, so no share has to be
-known. With `torchrun` each worker learns its own classifiers from its part of the batches.
+A weight is finite only if goals that do not depend on s' are drawn as well: the desired goal of the
+episode itself, or those of other episodes (goal source `actual`). q is the mixture of all sources,
+so their shares need not be known. With `torchrun` each worker learns its own classifiers from its
+part of the batches.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ Inputs = tuple[Tensor, Tensor]
 
 
 class DensityRatio(nn.Module):
-    """The two classifiers and their optimizer."""
+    """The two classifiers, without and with the next state, and their optimizer."""
 
     def __init__(self, feature_size: int, goal_size: int, action_size: int) -> None:
         super().__init__()
@@ -73,7 +74,7 @@ class DensityRatio(nn.Module):
 
 
 def _difference(goal: Tensor, achieved: Tensor) -> Tensor:
-    """Return inputs for the classifiers, (batch, goal_size + 1).
+    """Return the difference of two goals as inputs of the classifiers, (batch, goal_size + 1).
 
     The scaled and clipped difference per axis shows small distances; the logarithm of the distance
     shows large ones.
@@ -111,7 +112,7 @@ class WeightedDDPG(DDPG):
         return (self._weight * self.critic_loss.costs(self, batch)).mean()
 
     def _weights(self, batch: TensorBatch) -> Tensor:
-        """Train the classifiers; return the importance weights (batch,) of transitions."""
+        """Train the classifiers on a batch; return its importance weights, (batch,)."""
         goal = batch.goal.roll(1, dims=0)
         features = self.actor.features(batch.observation, goal)
         next_features = self.actor.features(batch.next_observation, goal)
@@ -132,9 +133,9 @@ class WeightedDDPG(DDPG):
         return weight
 
     def modules(self) -> dict[str, nn.Module]:
-        """Return the modules that a training state contains, by name."""
+        """Return the modules to save in the training state, by name."""
         return {**super().modules(), 'ratio': self._ratio}
 
     def optimizers(self) -> dict[str, torch.optim.Adam]:
-        """Return the optimizers whose states a training state contains, by name."""
+        """Return the optimizers to save in the training state, by name."""
         return {**super().optimizers(), 'ratio_optimizer': self._ratio.optimizer}

@@ -1,4 +1,4 @@
-"""Learning with frequent actions: actions with a length, and noise on weights."""
+"""Learning at high action frequencies: actions held for several ticks, and noise on weights."""
 
 from __future__ import annotations
 
@@ -23,24 +23,23 @@ from policy_node.training.learners.ddpg import DDPG, TensorBatch
 
 
 def ticks_of(length: Array32, most: int) -> NDArray[np.int64]:
-    """Convert lengths in [-1, 1] to whole numbers of ticks, 1 ... `most`; any shape."""
+    """Convert lengths of actions, [-1, 1] as the actor returns them, to ticks, 1 ... `most`."""
     share = (np.asarray(length, np.float64) + 1.0) / 2.0
     return 1 + np.rint(share * (most - 1)).astype(np.int64)
 
 
 def length_of(ticks: NDArray[np.int64], most: int) -> Array32:
-    """Convert numbers of ticks, 1 ... `most`, to lengths in [-1, 1], float32."""
+    """Convert ticks, 1 ... `most`, to lengths of actions in [-1, 1], float32."""
     return (2.0 * (ticks - 1) / (most - 1) - 1.0).astype(np.float32)
 
 
 class HoldingCollector(Collector):
-    """Holds each action for its length: the last number of what the actor returns.
+    """Collector that holds each action for several ticks; the actor's last output is their number.
 
-    The paper's own idea for very frequent actions (after Sharma et al. 2017, FiGAR). The actor
-    decides rarely and learns how rarely, so exploration goes further and values cross many ticks at
-    once. An action that holds for n more ticks is equally good experience in the middle of its
-    time, so each tick is stored with the ticks that are left. No action holds longer than its
-    episode. Arguments as `Collector`.
+    The paper suggests this for very frequent actions (after Sharma et al. 2017, FiGAR). The actor
+    decides rarely and learns how rarely. So exploration goes further, and values propagate over
+    many ticks at once. Every tick of a held action is stored as an action with the number of ticks
+    that are left. No action is held beyond the end of its episode. Arguments as `Collector`.
     """
 
     def __init__(self, simulation: Simulation, seeds: list[int], config: TrainConfig) -> None:
@@ -65,15 +64,15 @@ class HoldingCollector(Collector):
 
 
 class HoldingSampler(TransitionSampler):
-    """Samples transitions whose return has as many steps as their action still holds.
+    """Samples n-step transitions, where n is the number of ticks that the action still holds.
 
-    `most_steps` is the longest.
+    `most_steps` is the largest n.
     """
 
     def steps(
         self, starts: Starts, goal: Array32, generator: np.random.Generator
     ) -> NDArray[np.int64]:
-        """Return the steps (batch,) of each return: the ticks that its action still holds."""
+        """Return the length of each n-step return, (batch,): the ticks its action still holds."""
         del goal, generator
         length = starts.episodes.action[starts.row, starts.tick, -1]
         left: NDArray[np.int64] = starts.last - starts.tick
@@ -81,19 +80,19 @@ class HoldingSampler(TransitionSampler):
 
 
 class HoldingDDPG(DDPG):
-    """`DDPG` whose actions have a length; the evaluated actor decides at every tick."""
+    """`DDPG` whose actor also returns how long an action holds; evaluation ignores this output."""
 
     def _penalty(self, batch: TensorBatch, action: Tensor) -> Tensor:
         # The length of an action costs nothing.
         return super()._penalty(batch, action[..., :-1])
 
     def evaluation_actor(self) -> Actor:
-        """Return the actor to evaluate, without the output for the length of an action."""
+        """Return the actor to evaluate, without the output for how long an action holds."""
         return plain_actor(super().evaluation_actor(), self.config)
 
 
 def plain_actor(actor: Actor, config: TrainConfig) -> Actor:
-    """Return an actor without the output for the length; an actor that has none is unchanged."""
+    """Return an actor without the output for how long an action holds, if it has this output."""
     action_size = task_spec(config.task).robot.action_size
     if actor.shape.action_size == action_size:
         return actor
@@ -113,7 +112,7 @@ _FIRST_SCALE = 0.05
 
 
 class PerturbedActors(MemorylessPolicy):
-    """Several perturbed actors; each acts for an equal part of the batch."""
+    """Several actors with perturbed weights; each acts for an equal part of the batch."""
 
     def __init__(self, actors: list[Actor]) -> None:
         self._actors = actors
@@ -131,11 +130,12 @@ class PerturbedActors(MemorylessPolicy):
 
 
 class PerturbingCollector(Collector):
-    """Noise on the weights of the actor, constant within an episode (arXiv 1706.01905).
+    """Collector with noise on the actor's weights, constant within an episode (arXiv 1706.01905).
 
-    The scale adapts to the distance by which the noise moves actions. After every cycle it is
-    multiplied by wanted / measured distance, at most by 2 or 1/2. The paper takes steps of 1 %,
-    which is too slow for a few dozen cycles of long episodes. Arguments as `Collector`.
+    The scale of the noise adapts until actions move by `noise_std` (root mean square). After every
+    cycle it is multiplied by the ratio of wanted to measured distance, limited to 1/2 ... 2. The
+    cited paper changes it by 1 % at a time, which is too slow for a few dozen cycles of long
+    episodes. Arguments as `Collector`.
     """
 
     def __init__(self, simulation: Simulation, seeds: list[int], config: TrainConfig) -> None:

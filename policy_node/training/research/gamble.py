@@ -3,7 +3,8 @@
 Plappert et al. 2018, request 2: "Consider an environment with a special action which takes the
 agent to a uniformly random state and ends the episode. Such an action would seem to be perfect in
 hindsight if we replay with the goal achieved by the agent in the future." Two Fetch tasks ignore
-their gripper action, so here it is the special action, and everything else stays as it is.
+their gripper action. Here it is the special action, called a gamble; the random state is called its
+landing. Everything else stays as it is.
 """
 
 from __future__ import annotations
@@ -33,11 +34,11 @@ class GambleSimulation(Simulation):
 
     The landing is drawn like a goal by the generator of the episode, independent of its goal. From
     the gamble to the end of the episode the observation stays constant: the achieved goal at the
-    landing, no velocities, fingers at 1 m. The hidden physics continue.
+    landing, no velocities, fingers at 1 m. The physics continue, but are not observed.
 
     Args:
         task: One of `config.GAMBLE_TASKS`.
-        **options: Those of `Simulation`.
+        **options: Options of `Simulation`.
 
     Raises:
         ValueError: If the task uses its gripper, or an option is not allowed.
@@ -76,7 +77,7 @@ class GambleSimulation(Simulation):
         return StepResult(observation, reward, success, result.diverged)
 
     def _freeze(self, ids: NDArray[np.intp], observation: Array) -> None:
-        """Store the constant observation of each simulation in `ids` that has just gambled."""
+        """Store the constant observation of the simulations `ids`, which have just gambled."""
         frozen, parts = observation[ids], self._parts
         frozen[:, parts[self.spec.achieved_goal]] = self._landing[ids]
         if self.spec.has_object:
@@ -101,9 +102,9 @@ def is_over(observation: NDArray[np.floating], spec: TaskSpec) -> NDArray[np.boo
 
 
 def without_landings(episodes: Episodes, spec: TaskSpec) -> Episodes:
-    """Return the episodes with the achieved goals before the gamble in place of the landing.
+    """Replace the achieved goals after each gamble by the last one before it.
 
-    A landing is no motion of the robot. Only earlier motions count as such.
+    So a landing does not count as a motion of the robot.
     """
     over = is_over(episodes.observation, spec)
     # Once over, an episode stays so; at its start it is not.
@@ -115,7 +116,7 @@ def without_landings(episodes: Episodes, spec: TaskSpec) -> Episodes:
 
 
 def _parts(spec: TaskSpec) -> dict[str, slice]:
-    """Return the slices of the parts of an observation, by name."""
+    """Return the slice of each part of an observation, by name."""
     starts = np.cumsum([0, *(part.size for part in spec.observation)]).tolist()
     return {
         part.name: slice(start, start + part.size)

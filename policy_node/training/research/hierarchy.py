@@ -2,13 +2,14 @@
 
 Levy et al. 2019, "Learning Multi-Level Hierarchies with Hindsight" (HAC, arXiv 1712.00948), on one
 replay of whole episodes. The actor learns as in `DDPG`; half of the goals that are not relabelled
-are the subgoals that it pursued. Evaluation and the saved actor use the goal itself: then the actor
-is an ordinary one, and the benefit of the high level is what the actor has learned.
+are the subgoals that it pursued. In evaluations, the actor pursues the goal itself. So the saved
+actor is an ordinary one, and the high level matters only through what the actor has learned.
 
-Any N ticks of an episode are a transition of the high level, as if the actor were perfect: its
-action is the goal achieved after them. Tested proposals that were missed cost as much as never
-arriving, or the high level would propose the impossible. The rewards of the N ticks are discounted
-tick by tick and added, so the values of both levels have the same scale.
+Any N ticks of an episode are a transition of the high level. Its action is the goal achieved after
+these ticks, as if the actor had reached its subgoal. Some subgoals are tested: the actor pursues
+them without noise. A tested subgoal that it misses gets the lowest possible value. Otherwise, the
+high level would propose goals out of reach. The rewards of the N ticks are discounted tick by tick
+and added, so the values of both levels have the same scale.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ _SMALLEST_NORM = 1e-6
 
 
 def subgoals_of(starts: Starts, generator: np.random.Generator | None = None) -> Array32:
-    """Return the subgoals (batch, goal_size) that were pursued where transitions begin."""
+    """Return the subgoals pursued at the start of each transition, (batch, goal_size)."""
     del generator
     episodes = starts.episodes
     size = episodes.desired_goal.shape[-1]
@@ -51,11 +52,11 @@ def subgoals_of(starts: Starts, generator: np.random.Generator | None = None) ->
 
 @dataclass(frozen=True, slots=True)
 class Proposer:
-    """A high level that proposes goals.
+    """A copy of the high level, which proposes subgoals to the actor.
 
     Attributes:
-        policy: Its actions (N, goal size) in [-1, 1] span `NORMALIZED_CLIP` standard deviations of
-            goals, the range that the networks can distinguish.
+        policy: Returns actions (N, goal size) in [-1, 1]. They span `NORMALIZED_CLIP` standard
+            deviations of goals, the range that the networks can distinguish.
         mean: Mean of goals, (goal size,).
         std: Standard deviation of goals, (goal size,).
         is_pose: Whether goals end with a unit quaternion.
@@ -84,7 +85,8 @@ class GuidedPolicy:
     """Actor and high level as one policy without noise, for whole episodes.
 
     Args:
-        every: Ticks for which a subgoal holds.
+        every: Number of ticks for which a subgoal holds.
+        ticks: Number of ticks of an episode.
     """
 
     def __init__(self, actor: Policy, proposer: Proposer, every: int, ticks: int) -> None:
@@ -111,11 +113,11 @@ class GuidedPolicy:
 
 
 class GuidedCollector(Collector):
-    """Replaces the goals of the actor by proposals of a `GuidedPolicy`, with noise on both.
+    """Collector whose actor pursues subgoals of a `GuidedPolicy`; both levels have noise.
 
-    The noise on proposals is in standard deviations of goals. A random proposal is normal with the
-    mean and deviation of goals. The actions of an episode are followed by the subgoal and by
-    whether it is tested. Arguments as `Collector`.
+    The noise on subgoals is in standard deviations of goals. Random subgoals are drawn from a
+    normal distribution with the mean and deviation of goals. Each recorded action is followed by
+    the subgoal, and by 1 if the subgoal is tested, else 0. Arguments as `Collector`.
     """
 
     def __init__(self, simulation: Simulation, seeds: list[int], config: TrainConfig) -> None:
@@ -169,7 +171,7 @@ _HIGH = 'high_'
 def with_subgoals(mixture: dict[str, float]) -> dict[str, float]:
     """Return the mixture with half of the goals of episodes replaced by subgoals.
 
-    HAC would replace all, but its lowest level never gets the goal itself.
+    HAC would replace all of them, because its lowest level never pursues the goal itself.
     """
     kept = mixture.get('real', 0.0) / 2
     return mixture if kept == 0.0 else {**mixture, 'real': kept, _SUBGOAL: kept}
@@ -177,10 +179,10 @@ def with_subgoals(mixture: dict[str, float]) -> dict[str, float]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class HierarchicalTransitions(Transitions):
-    """A batch for both levels.
+    """A batch for the actor, together with a batch for the high level.
 
     Attributes:
-        high: Batch of the high level, whose actions are goals (batch, goal_size).
+        high: Batch for the high level, whose actions are goals (batch, goal_size).
     """
 
     high: Transitions
@@ -188,7 +190,7 @@ class HierarchicalTransitions(Transitions):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SubgoalSampler(TransitionSampler):
-    """Makes transitions of the high level; `most_steps` is the number of ticks of a subgoal."""
+    """Draws transitions of the high level, each over the `most_steps` ticks of a subgoal."""
 
     missed_value: float
 
@@ -215,7 +217,7 @@ class SubgoalSampler(TransitionSampler):
     def _ticks(
         self, episodes: Episodes, count: int, generator: np.random.Generator
     ) -> NDArray[np.int64]:
-        """Draw the ticks (count,) at which transitions begin; some are ticks with a proposal."""
+        """Draw the ticks (count,) at which transitions begin; some of them begin a subgoal."""
         last, every = episodes.ticks - self.most_steps, self.most_steps
         decision = every * generator.integers(last // every + 1, size=count)
         anywhere = generator.integers(last + 1, size=count)
@@ -224,7 +226,7 @@ class SubgoalSampler(TransitionSampler):
     def _with_tests(self, starts: Starts, batch: Transitions) -> Transitions:
         """Return the batch with a penalty for tested subgoals that were missed.
 
-        Their action is the subgoal and their value is the lowest possible, for any goal.
+        Their transitions get the subgoal as action and the lowest possible value, for any goal.
         """
         subgoal = subgoals_of(starts)
         pairs = batch.action.astype(np.float64), subgoal.astype(np.float64)
@@ -261,7 +263,7 @@ class HierarchicalExperience(Experience):
 
 
 class HighLevel(DDPG):
-    """The learner of the high level, whose actions are goals, above a learner of actions."""
+    """`DDPG` of the high level, whose actions are goals; it uses the normalizers of `low`."""
 
     def __init__(self, shape: NetworkShape, low: DDPG) -> None:
         # A penalty of large actions would prefer goals in the middle of all goals.
@@ -279,14 +281,14 @@ class HighLevel(DDPG):
         return replace(tensors, action=action)
 
     def proposer(self, averaged: bool = False) -> Proposer:
-        """Return a copy on the CPU that proposes goals."""
+        """Return a copy on the CPU that proposes subgoals, with averaged weights if `averaged`."""
         actor = self.plain(self.average_actor if averaged else self.actor.network)
         normalizer = actor.goal_normalizer
         return Proposer(actor, normalizer.mean.numpy(), normalizer.std.numpy(), self._is_pose)
 
 
 class HierarchicalDDPG(DDPG):
-    """The actor, which learns as in `DDPG`, and a high level; arguments as `DDPG`."""
+    """`DDPG` of the actor, with a `HighLevel` above it; arguments as `DDPG`."""
 
     def _set_up(self, shape: NetworkShape) -> None:
         self.high = HighLevel(shape, self)
@@ -300,22 +302,22 @@ class HierarchicalDDPG(DDPG):
         return super().update(batch)
 
     def average(self) -> None:
-        """Call this method of `ActorCritic` for both levels."""
+        """Move the averaged actors of both levels towards the actors."""
         super().average()
         self.high.average()
 
     def set_progress(self, progress: float) -> None:
-        """Call this method of `ActorCritic` for both levels."""
+        """Set the learning rates of both levels to those at `progress`."""
         super().set_progress(progress)
         self.high.set_progress(progress)
 
     def acting_policy(self) -> Policy:
-        """Return the policy that collects; before the first update the actor alone."""
+        """Return the policy that collects: the actor before the first update, then both levels."""
         actor = super().acting_policy()
         return self._guided(actor, self.high.proposer()) if self.updates else actor
 
     def other_policies(self) -> dict[str, Policy]:
-        """Return both levels as one policy."""
+        """Return both levels as one policy to evaluate; nothing before the first update."""
         if not self.updates:
             return {}
         both = self._guided(self.evaluation_actor(), self.high.proposer(averaged=True))
@@ -326,11 +328,11 @@ class HierarchicalDDPG(DDPG):
         return GuidedPolicy(actor, proposer, self.config.subgoal_every, spec.episode_ticks)
 
     def modules(self) -> dict[str, nn.Module]:
-        """Return the modules that a training state contains, by name."""
+        """Return the modules to save in the training state, by name."""
         high = {f'{_HIGH}{name}': module for name, module in self.high.modules().items()}
         return {**super().modules(), **high}
 
     def optimizers(self) -> dict[str, torch.optim.Adam]:
-        """Return the optimizers whose states a training state contains, by name."""
+        """Return the optimizers to save in the training state, by name."""
         high = {f'{_HIGH}{name}': value for name, value in self.high.optimizers().items()}
         return {**super().optimizers(), **high}

@@ -1,10 +1,11 @@
-"""Batches that depend on the learner: chosen goals and corrected returns of several steps.
+"""Batches that depend on the learner: chosen hindsight goals and corrected n-step returns.
 
-A return of n steps carries rewards back n times as fast, but it is the return of the actions taken,
-not of the actor's. `correction=lambda` draws the number of steps from a geometric distribution cut
-at n. The mean target is then the truncated lambda-return (Sutton and Barto 2018, 12.3); the average
-of MHER(lambda) (arXiv 2102.12962) gives the longest return less weight. `correction=cut` ends a
-return before the first action that is far from the actor's for the same goal.
+An n-step return propagates rewards n times as fast. But it contains the actions taken, not those
+that the actor would take now. `correction=lambda` draws the number of steps from a geometric
+distribution cut at n. The mean target is then the truncated lambda-return (Sutton and Barto 2018,
+12.3); the average of MHER(lambda) (arXiv 2102.12962) gives the longest return less weight.
+`correction=cut` ends a return before the first action that is far from the actor's action for the
+same goal.
 """
 
 from __future__ import annotations
@@ -56,10 +57,10 @@ SCORES: dict[str, Callable[[DDPG, Transitions], Array32]] = {
 
 @dataclass(frozen=True, kw_only=True)
 class ChoosingSampler(TransitionSampler):
-    """Relabels with the future goal, of several drawn, from which the critic learns most.
+    """Draws several future goals per transition and keeps the one that `choice` ranks first.
 
     Attributes:
-        judge: The learner; its critic or actor judges.
+        judge: The learner whose critics rank the goals.
         choice: `bellman` (largest error of the value) or `uncertain` (largest difference between
             critics).
     """
@@ -70,7 +71,7 @@ class ChoosingSampler(TransitionSampler):
     def relabel(
         self, starts: Starts, mixture: dict[str, float], generator: np.random.Generator
     ) -> Array32:
-        """Draw goals; replace each future goal by the best of several, as `choice` ranks them."""
+        """Draw a goal for each transition; choose each future goal from several candidates."""
         source = draw_sources(mixture, len(starts.row), generator)
         goal = goals_of(starts, source, list(mixture), generator)
         rows = np.flatnonzero(np.array(list(mixture))[source] == 'future')
@@ -79,7 +80,7 @@ class ChoosingSampler(TransitionSampler):
         return goal
 
     def _best(self, starts: Starts, first: Array32, generator: np.random.Generator) -> Array32:
-        """Return the future goals (batch, goal_size) that `choice` ranks first."""
+        """Return the best of `first` and further future goals for each transition."""
         candidates, source = [first], np.zeros(len(first), np.intp)
         for _ in range(CANDIDATES - 1):
             candidates.append(goals_of(starts, source, ['future'], generator))
@@ -93,25 +94,25 @@ class ChoosingSampler(TransitionSampler):
 
 @dataclass(frozen=True, kw_only=True)
 class LambdaSampler(TransitionSampler):
-    """Returns with a random number of steps, whose mean is the truncated lambda-return."""
+    """Draws n-step returns with random n, whose mean is the truncated lambda-return."""
 
     trace: float = 0.7
 
     def steps(
         self, starts: Starts, goal: Array32, generator: np.random.Generator
     ) -> NDArray[np.int64]:
-        """Draw the steps (batch,) of each return."""
+        """Draw the length of each n-step return in steps, (batch,)."""
         most = super().steps(starts, goal, generator)
         return np.minimum(generator.geometric(1.0 - self.trace, len(most)), most)
 
 
 @dataclass(frozen=True, kw_only=True)
 class CuttingSampler(TransitionSampler):
-    """Returns that end before an action far from the actor's.
+    """Ends n-step returns before the first action that is far from the actor's action.
 
     Attributes:
-        judge: The learner; its critic or actor judges.
-        cut_distance: Largest distance from the actor's action, root mean square.
+        judge: The learner with the actor to compare with.
+        cut_distance: Largest root mean square distance of the two actions in a return.
     """
 
     judge: DDPG
@@ -120,7 +121,7 @@ class CuttingSampler(TransitionSampler):
     def steps(
         self, starts: Starts, goal: Array32, generator: np.random.Generator
     ) -> NDArray[np.int64]:
-        """Return the number of steps (batch,) of each return, up to the first distant action."""
+        """Return the length of each n-step return in steps, (batch,)."""
         most = super().steps(starts, goal, generator)
         steps = np.ones_like(most)
         episodes = starts.episodes
@@ -137,16 +138,16 @@ class CuttingSampler(TransitionSampler):
 
 
 class JudgedExperience(Experience):
-    """Batches from a sampler that depends on the learner. Statistics are collected without it.
+    """Experience whose batches come from a sampler that depends on the learner.
 
     Attributes:
-        judged: The sampler of the batches.
+        judged: The sampler of the batches. Statistics of normalizers use a plain sampler.
     """
 
     judged: TransitionSampler
 
     def narrow(self, progress: float) -> None:
-        """Narrow the thresholds of both samplers; `progress` is the share of training done."""
+        """Set the reward thresholds to those at `progress`, the finished share of the run."""
         super().narrow(progress)
         self.judged = self.judged.at(progress)
 

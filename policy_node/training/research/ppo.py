@@ -2,8 +2,8 @@
 
 The policy is the actor with Gaussian noise of `noise_std`, clipped to the range of actions as in
 the collector. The density of a clipped action is that of the noise beyond the limit (Fujita & Maeda
-2018, arXiv 1802.07564). So the densities are those of the collected actions, except that the
-normalizers include the new episodes; from the fourth cycle on the difference is very small.
+2018, arXiv 1802.07564). So the densities are those of the collected actions, with one exception:
+the normalizers already include the new episodes. From the fourth cycle on, this hardly matters.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ class RolloutTransitions(Transitions):
     """Transitions of the newest rollouts.
 
     Attributes:
-        log_probability: (batch,) of the action, for the actor before the first update on these
-            rollouts. Its normalizers include the new episodes already.
-        advantage: (batch,) of the action, with standard deviation 1.
-        value_target: (batch,) target value of the state.
-        weight: (batch,) weight of the transition in all losses.
+        log_probability: Log density of the action, (batch,), for the actor before the first update
+            on these rollouts. Its normalizers include the new episodes already.
+        advantage: Advantage of the action, (batch,), with standard deviation 1.
+        value_target: Target for the value of the state, (batch,).
+        weight: Weight of the transition in all losses, (batch,).
     """
 
     log_probability: Array32
@@ -48,10 +48,10 @@ class RolloutTransitions(Transitions):
 
 
 class PPO(ActorCritic):
-    """An actor, a critic of states, and one update.
+    """Learner of proximal policy optimisation: an actor, and a critic that values states.
 
     Args:
-        workers: This worker among all; gradients are averaged over all.
+        workers: Processes that train together; gradients are averaged over them.
     """
 
     def __init__(
@@ -65,7 +65,7 @@ class PPO(ActorCritic):
         super().__init__(actor, critic, config, device, workers)
 
     def update(self, batch: Transitions) -> Losses:
-        """Improve critic and actor on a batch of rollouts."""
+        """Improve critic and actor by one gradient update on a batch of rollouts."""
         assert isinstance(batch, RolloutTransitions)
         features = self.actor.features(self.tensor(batch.observation), self.tensor(batch.goal))
         weight = self.tensor(batch.weight)

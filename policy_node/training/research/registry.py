@@ -1,4 +1,4 @@
-"""Choose the parts of a run: those of the core, or what a study puts in their place.
+"""Select the parts of a run: the usual ones, or those that a study puts in their place.
 
 This is the only module of the folder that other folders import.
 """
@@ -92,10 +92,11 @@ def make_sampler(
 ) -> TransitionSampler:
     """Return the sampler of transitions that the configuration selects.
 
-    Two samplers need a learner, `judge`. Without one, the plain sampler replaces them.
+    `ChoosingSampler` and `CuttingSampler` need a learner, `judge`. Without it, `TransitionSampler`
+    takes their place.
 
     Raises:
-        ValueError: If the configuration replaces the own reward of a third-party task.
+        ValueError: If the configuration would replace the reward that a third-party task defines.
     """
     fields = sampler_fields(config, metric)
     if config.longest_hold > 1:
@@ -126,7 +127,7 @@ def make_learner(
     """Return the learner and its experience.
 
     Raises:
-        ValueError: As `make_sampler`.
+        ValueError: If the configuration would replace the reward that a third-party task defines.
     """
     spec = metric.spec
     common = config, spec, workers, make_sampler(config, metric), generator
@@ -148,7 +149,7 @@ def make_learner(
 def make_ddpg(
     shape: NetworkShape, config: TrainConfig, device: torch.device, workers: Workers
 ) -> DDPG:
-    """Return `DDPG` or the learner that takes its place; arguments as `DDPG`."""
+    """Return the variant of `DDPG` that the configuration selects; arguments as `DDPG`."""
     kinds = (kind for name, kind in _LEARNERS.items() if getattr(config, name) != DEFAULTS[name])
     return next(kinds, DDPG)(shape, config, device, workers, critics.critic_loss(config))
 
@@ -159,12 +160,12 @@ def network_shape(config: TrainConfig) -> NetworkShape:
 
 
 def _extra_actions(config: TrainConfig) -> int:
-    """Return how many outputs the actor has beside the action: 1 if actions have a length."""
+    """Return the number of actor outputs beside the action: 1 for how long it holds, or 0."""
     return int(config.longest_hold > 1)
 
 
 def _weights_of(config: TrainConfig, spec: TaskSpec) -> Weigh:
-    """Return the function that marks episodes in which something moved; a gamble does not count."""
+    """Return the function that marks episodes whose achieved goal moved without a gamble."""
     if not config.gamble:
         return has_moved
     return lambda episodes: has_moved(gamble.without_landings(episodes, spec))

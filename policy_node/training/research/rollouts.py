@@ -16,8 +16,9 @@ An episode that is replayed for what it achieved itself always succeeds, so the 
 actor nothing about acting at all: leaving the block alone succeeds, too, and touching it delays
 success (`bench/hindsight_pull.py`). Hindsight policy gradients sum over goals that do not depend on
 the episode. The source `outcome` does the same: outcomes of other episodes, moved to the start of
-this one, without those that are already met there. Of a few the nearest to the desired goal is
-taken (as HGG, Ren et al. 2019, arXiv 1906.04279), so goals approach those of the task.
+this one, without those that are already met there. Of a few candidates, the one nearest to the
+desired goal is taken (as HGG, Ren et al. 2019, arXiv 1906.04279). So goals approach those of the
+task.
 """
 
 from __future__ import annotations
@@ -65,10 +66,10 @@ _LARGEST_RATIO, _LARGEST_TRACE = 10.0, 1.0
 
 @dataclass(frozen=True, slots=True)
 class RolloutMaker:
-    """Makes rollouts of episodes.
+    """Makes transitions with advantages from episodes, for their own and for relabelled goals.
 
     Attributes:
-        critique: Values of states and densities of actions.
+        critique: Learner that returns the values of states and the densities of actions.
         compute_reward: (achieved_goal, desired_goal) -> reward, batched.
         corrects: Whether replayed episodes get per-decision weights.
     """
@@ -83,7 +84,7 @@ class RolloutMaker:
         """Return all transitions of episodes with their own goals, and with each of `goals`.
 
         Args:
-            goals: Goals (episodes, goal_size) to replay them for.
+            goals: Arrays (episodes, goal_size) of goals for which all episodes are replayed.
 
         Returns:
             The transitions, episode by episode; advantages have weighted mean 0 and deviation 1.
@@ -169,7 +170,7 @@ def advantages(
 
 
 def decision_weights(log_ratio: NDArray[np.floating]) -> Array:
-    """Return per-decision weights (episodes, T) of mean 1 at each tick.
+    """Return per-decision importance weights (episodes, T), whose mean is 1 at each tick.
 
     Args:
         log_ratio: (episodes, T) log pi(a | s, g') - log pi(a | s, g).
@@ -181,11 +182,11 @@ def decision_weights(log_ratio: NDArray[np.floating]) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class Outcomes:
-    """First achieved goals of episodes, and later ones that differ from them.
+    """Goals achieved at the start of episodes, and different ones achieved later.
 
     Attributes:
-        before: (count, goal_size) achieved in first states.
-        after: (count, goal_size) achieved in later states, each not met by `before`.
+        before: Goals achieved in the first states of episodes, (count, goal_size).
+        after: Goals achieved later in these episodes, (count, goal_size), not met by `before`.
     """
 
     before: Array32
@@ -194,7 +195,7 @@ class Outcomes:
 
     @classmethod
     def of(cls, episodes: Episodes, metric: GoalMetric, generator: np.random.Generator) -> Outcomes:
-        """Draw some states of each episode and keep those that changed enough."""
+        """Draw states of each episode; keep those whose goal was not met at the start."""
         row = np.repeat(np.arange(len(episodes)), _STATES)
         tick = generator.integers(1, episodes.ticks + 1, size=len(row))
         before, after = episodes.achieved_goal[row, 0], episodes.achieved_goal[row, tick]
@@ -207,8 +208,8 @@ class Outcomes:
     def goals(self, starts: Starts, generator: np.random.Generator) -> Array32:
         """Return one goal per episode, (batch, goal_size): the outcome nearest to its desired goal.
 
-        A few outcomes of other episodes are drawn and moved to the start of this one. Without
-        outcomes it is the desired goal itself.
+        A few outcomes are drawn and moved to the start of the episode. If there are no outcomes,
+        the desired goals are returned.
         """
         desired = starts.episodes.desired_goal[starts.row]
         if not len(self):
@@ -244,7 +245,7 @@ def goals_in_hindsight(
 
 
 class OnPolicyExperience(Experience):
-    """Whole episodes of the newest cycle, with their own goals and `hindsight_k` others each.
+    """Episodes of the newest cycle, each with its own goal and `hindsight_k` relabelled ones.
 
     Args:
         config: The configuration; `trace` is the lambda of the advantages.
@@ -272,7 +273,7 @@ class OnPolicyExperience(Experience):
         self._weight_up_to = np.zeros(0)
 
     def batch(self, env_steps: int) -> Transitions:
-        """Draw from the rollouts of the newest cycle, which the first call of a cycle makes."""
+        """Draw from the rollouts of the newest cycle; the first call of a cycle makes these."""
         if self._rollouts is None or env_steps != self._made_after:
             self._rollouts, self._made_after = self._roll_out(), env_steps
         row, ticks = self._draw_rows(), self.replay.ticks
@@ -293,8 +294,8 @@ class OnPolicyExperience(Experience):
     def mixture(self) -> dict[str, float]:
         """Return the probability of each goal source, for the statistics of goals.
 
-        These statistics use single transitions, which have no `outcome`: `episode` goals, of the
-        same distribution, take its share.
+        These statistics use single transitions, for which the source `outcome` is not defined.
+        The source `episode`, with the same distribution, takes its share.
         """
         found = dict(super().mixture())
         if _OUTCOME in found:

@@ -1,1 +1,1 @@
-"""How much of its success a policy keeps on a disturbed robot."""
+"""Measure how much of its success a policy keeps on a disturbed robot."""

@@ -104,7 +104,7 @@ def _run(options: argparse.Namespace) -> int:
 def _start(
     options: argparse.Namespace, loaded: LoadedPolicy, simulation: Simulation, file: Path
 ) -> dict[str, Any]:
-    """Return the result without its points, or with those that the file holds."""
+    """Return the result to complete; it has points only if an earlier run wrote some to `file`."""
     result: dict[str, Any] = {
         'policy': Path(options.policy or loaded.task).name,
         'task': loaded.task,
@@ -149,7 +149,7 @@ def _measure_in_worker(point: Point) -> dict[str, Any]:
 def _measured_in_workers(
     options: argparse.Namespace, missing: Sequence[Point]
 ) -> Iterator[dict[str, Any]]:
-    """Yield the results of points, in order, that several processes evaluate."""
+    """Evaluate points in several processes; yield the results in the order of the points."""
     jobs = min(options.jobs, len(missing))
     threads = options.threads or max(1, len(os.sched_getaffinity(0)) // jobs)
     own = argparse.Namespace(**{**vars(options), 'threads': threads})
@@ -170,7 +170,7 @@ def _measure(
     loaded: LoadedPolicy,
     file: Path,
 ) -> None:
-    """Evaluate the points that are missing; write the file after each."""
+    """Evaluate the points that `result` lacks; write the file after each of them."""
     missing = [each for each in points(simulation.spec) if each.key not in result['points']]
     if options.jobs > 1 and missing:
         found = _measured_in_workers(options, missing)
@@ -186,7 +186,7 @@ def _measure(
 def _measured(
     options: argparse.Namespace, simulation: Simulation, loaded: LoadedPolicy, point: Point
 ) -> dict[str, Any]:
-    """Return the result of a point."""
+    """Evaluate the policy at one point; return its entry of the result file."""
     simulation.disturbances = point.disturbances
     bounded = replace(loaded, is_bounded=True)
     outcomes = evaluate(simulation, bounded, options.episodes, options.first_seed)

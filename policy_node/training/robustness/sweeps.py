@@ -1,4 +1,4 @@
-"""The disturbances of a robustness curve, their levels, and what a policy keeps up to each."""
+"""The disturbances of a robustness curve, their levels, and which ones a policy withstands."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ class Sweep:
 
     Attributes:
         levels: Levels, mildest first.
-        at: Makes the disturbances of a level, as `Disturbances.from_dict` reads them.
-        needs_object: Whether only tasks with an object have it.
+        at: Function from a level to the disturbances, as `Disturbances.from_dict` reads them.
+        needs_object: Whether it applies only to tasks with an object.
     """
 
     name: str
@@ -39,7 +39,7 @@ def _one(group: str, name: str) -> Callable[[float], dict[str, Any]]:
 
 
 def _factors(*names: str) -> Callable[[float], dict[str, Any]]:
-    """Every episode draws a factor between 1/level and level."""
+    """Return a function from a level to physics factors, drawn between 1/level and level."""
     return lambda level: {'physics': {name: [1.0 / level, level] for name in names}}
 
 
@@ -80,7 +80,7 @@ class Point:
 
     @property
     def key(self) -> str:
-        """Name in the result."""
+        """Key of this point in the result file."""
         return f'{self.name} {self.level:g}'
 
 
@@ -95,18 +95,18 @@ def points(spec: TaskSpec) -> Iterator[Point]:
 
 
 def sweeps_of(spec: TaskSpec) -> Sequence[Sweep]:
-    """Return the disturbances that a task has."""
+    """Return the sweeps that apply to a task."""
     return [sweep for sweep in SWEEPS if spec.has_object or not sweep.needs_object]
 
 
 def kept_up_to(sweep: Sweep, success: Mapping[str, float], undisturbed: float) -> float | None:
-    """Return the highest level up to which `KEPT` of the success is kept at every level.
+    """Return the highest level a policy withstands; it keeps `KEPT` of its success up to there.
 
     Args:
         success: Success by `Point.key`.
 
     Returns:
-        The level; None if the success is lost at the first one.
+        The level; None if the policy does not withstand the first level.
     """
     kept = None
     for level in sweep.levels:
@@ -117,7 +117,7 @@ def kept_up_to(sweep: Sweep, success: Mapping[str, float], undisturbed: float) -
 
 
 def sentence(spec: TaskSpec, control_hz: float, success: Mapping[str, float]) -> str:
-    """Return what a policy keeps, in one sentence."""
+    """Return one sentence with the levels of each disturbance that a policy withstands."""
     if not success['none 0']:
         return f'{spec.name}: no success without disturbances, so there is none to keep.'
     kept, lost = [], []

@@ -1,1 +1,1 @@
-"""One run: the training loop, its folder, its files, where it starts from."""
+"""One run: its training loop, its folder and files, and its initial networks."""

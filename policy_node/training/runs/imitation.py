@@ -118,7 +118,7 @@ class ImitationTrainer(BaseTrainer):
         return critic.requires_grad_(False)
 
     def train(self, log: RunLog | None = None) -> str:
-        """Run until a limit is reached or `stop` is called; return why it ended.
+        """Train until a limit is reached or `stop` is called; return the reason in words.
 
         Raises:
             OSError: If a file cannot be written; the earlier files stay.

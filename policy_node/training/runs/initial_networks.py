@@ -112,12 +112,12 @@ class InitialNetworks:
         return fitted._with_critics(0)
 
     def _shape_in(self, config: TrainConfig) -> NetworkShape:
-        """Return `shape` with the past actions of a run, if the networks have none."""
+        """Return `shape`; if it has no past actions, with those of the configuration."""
         past = self.shape.past_actions or config.past_actions
         return replace(self.shape, past_actions=past)
 
     def _with_past_of(self, config: TrainConfig) -> InitialNetworks:
-        """Return a copy with the past actions of a run as inputs; `self` if it needs no change.
+        """Return a copy with the configured past actions as inputs; `self` if nothing changes.
 
         The weights of these inputs start at zero; the normalizer starts at mean 0 and deviation 1.
         """
@@ -155,7 +155,7 @@ class InitialNetworks:
         return replace(self, tensors=tensors, origin=self.origin | known)
 
     def completed(self, learner: ActorCritic) -> dict[str, Tensor]:
-        """Return all tensors; critics that are missing here are those of `learner`."""
+        """Return all tensors; missing critics are taken from `learner`."""
         tensors = dict(self.tensors)
         for part, module in learner.modules().items():
             if given := members_of(part_of(self.tensors, part)):
@@ -255,8 +255,7 @@ def _read_usual(file: Path, source: Path) -> tuple[TrainingState, TrainConfig]:
     """Read a training state from `file` and return it with its configuration.
 
     Raises:
-        ValueError: If it is damaged, or other runs cannot start from such networks. The message
-            names `source`.
+        ValueError: If the file is damaged, or if no other run can start from its networks.
     """
     state = read_state(file)
     config = config_from_dict(state.extra['config'])
@@ -266,7 +265,7 @@ def _read_usual(file: Path, source: Path) -> tuple[TrainingState, TrainConfig]:
 
 
 def _unconditioned(tensors: dict[str, Tensor], config: TrainConfig) -> dict[str, Tensor]:
-    """Return networks without the input of `condition`; it is fixed at its value for acting.
+    """Return networks without the `condition` input, which is fixed at its value for acting.
 
     Networks without such an input are returned unchanged.
     """
@@ -307,8 +306,8 @@ def steps_behind(run: dict[str, Any]) -> int:
 def _run_of(part: dict[str, Any], steps: int) -> object:
     """Return a key that is equal for all actors of a run.
 
-    It contains the folder of the run, or without a folder the hash or name of the actor and
-    `steps`.
+    The key is the folder of the run. If the folder is unknown, it consists of the hash or name of
+    the actor and `steps`.
     """
     name = part.get('name', '')
     if name and ',' not in name:

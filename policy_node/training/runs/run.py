@@ -57,10 +57,10 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 @dataclass(slots=True)
 class Caller:
-    """The Python program that called `train`. Its second Ctrl-C raises KeyboardInterrupt.
+    """The Python program that called `train`; a second Ctrl-C raises KeyboardInterrupt in it.
 
     Attributes:
-        on_cycle: Function to call after each cycle with its row, or None.
+        on_cycle: Function to call after each cycle with its row of `progress.csv`, or None.
         quiet: Show no progress.
         error: Exception that `on_cycle` raised, which ended the run; None without one.
     """
@@ -136,7 +136,7 @@ def train_run(
         output: Folder of the run.
         resume: Continue the run in the folder; otherwise the folder must contain no run.
         command: Command line or call that started the run, for the record.
-        experience: Logged episodes to learn from as well; None for none.
+        experience: Logged episodes to learn from in addition to collected ones, or None.
         caller: The calling Python program; None if a command started the run.
 
     Raises:
@@ -181,10 +181,10 @@ def _make_trainer(
     resume: bool,
     experience: Episodes | None,
 ) -> AnyTrainer:
-    """Return a trainer that is ready to train, with initial networks, resumed state and episodes.
+    """Return a trainer with its initial networks or resumed state, and with logged episodes.
 
     Raises:
-        ValueError: If something does not fit the configuration or the memory of the machine.
+        ValueError: If one of these does not fit the configuration, or memory is too small.
     """
     try:
         workers = join_workers(choose_device(config.device))
@@ -259,9 +259,9 @@ def _train(
 
 
 def _prepare_folder(trainer: AnyTrainer, output: Path, command: str, resume: bool) -> None:
-    """Move files of an earlier run away, and record the command of this one.
+    """Move files of an earlier run into a subfolder, and record the command of this run.
 
-    It also warns of parts of learning that never happen and of an emulated `bfloat16`.
+    Also warn of parts of training that have no effect, and of slow, emulated bfloat16.
     """
     if not resume and (note := set_former_run_aside(output)):
         complain(NAME, note)

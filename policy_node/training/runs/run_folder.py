@@ -50,7 +50,7 @@ def companion_file(actor: Path) -> Path:
 def set_former_run_aside(folder: Path) -> str:
     """Move the files of an earlier run without a training state into a subfolder `former*`.
 
-    Otherwise the new run would append to its log or keep its best actor.
+    Otherwise the new run would append to the earlier log or keep the earlier best actor.
 
     Returns:
         A sentence that names both folders; '' if there were no files.
@@ -96,8 +96,8 @@ class RunFolder:
     def keep_best(self, outcomes: EpisodeOutcomes, actor: Actor, counters: Counters) -> None:
         """Save an evaluated actor if its success, or at equal success its return, is the highest.
 
-        `counters` gets the new best success and return. An evaluation that was cut short decides
-        nothing.
+        `counters` gets the new best success and return. An evaluation that ended early
+        has no effect.
         """
         rule = self.config.success_rule
         success = success_rate(outcomes, rule)
@@ -112,10 +112,11 @@ class RunFolder:
             self.save_actor(BEST_FILE, actor, counters.env_steps, measured)
 
     def read_best(self, counters: Counters) -> None:
-        """Set the best success and return in `counters`, of a resumed run, from its best actor.
+        """Set the best success and return of a resumed run, in `counters`, from its best actor.
 
         The best actor may be newer than the training state. If it is missing, damaged, of another
-        task or was evaluated otherwise, both are reset, and the next evaluated actor replaces it.
+        task, or evaluated on fewer episodes or by another rule, success and return are reset. Then
+        the next evaluated actor replaces it.
         """
         file, rule = self.path / BEST_FILE, self.config.success_rule
         if counters.best_success < 0 and not file.is_file():
@@ -139,7 +140,7 @@ class RunFolder:
     def save_when_due(
         self, learner: ActorCritic, experience: Experience, counters: Counters
     ) -> None:
-        """Save if `checkpoint_seconds` have passed, the replay less often.
+        """Write a checkpoint if `checkpoint_seconds` have passed; save the replay less often.
 
         If a file cannot be written, for example on a full disk, only warn.
         """

@@ -1,4 +1,4 @@
-"""The log of a run: a live line in the terminal, CSV, TensorBoard if installed, curve as PNG."""
+"""The log of a run: terminal line, CSV file, TensorBoard (if installed) and curve as PNG."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class RunLog:
 
     Args:
         output: Folder of the run. A resumed run appends to its log.
-        total_steps: Environment steps of the whole run, for the remaining time.
+        total_steps: Environment steps of the whole run, to estimate the remaining time.
         time_limit: Time limit of the run, seconds; 0 means none.
         resumed_steps: Environment steps of the checkpoint that the run resumes from. Later rows are
             removed, because the run repeats these steps.
@@ -163,7 +163,7 @@ def evaluation_columns(outcomes: EpisodeOutcomes | None, success_rule: str) -> R
 
 
 def loss_columns(losses: Sequence[Losses]) -> Row:
-    """Return the mean losses of a cycle by column of `progress.csv`; None without updates."""
+    """Return the mean losses of a cycle by column of `progress.csv`, each None without updates."""
     found: Row = {}
     for name, column in _LOSS_COLUMNS.items():
         values = [getattr(loss, name) for loss in losses]
@@ -182,7 +182,7 @@ def _clock(seconds: float) -> str:
 
 
 def _rows_until(path: Path, env_steps: int) -> list[dict[str, str]]:
-    """Return the rows of a log up to `env_steps`, as text; none for 0 steps or without a log."""
+    """Return the rows of a log up to `env_steps`, as text; empty for 0 steps or without a log."""
     if env_steps == 0 or not path.is_file():
         return []
     return [row for row, numbers in _valid_rows(path) if numbers['env_steps'] <= env_steps]
@@ -191,7 +191,7 @@ def _rows_until(path: Path, env_steps: int) -> list[dict[str, str]]:
 def _valid_rows(path: str | Path) -> Iterator[tuple[dict[str, str], dict[str, float]]]:
     """Yield each row of a log twice: as text, and as numbers without empty columns.
 
-    Damaged rows are left out, also a last row that a killed run has cut short.
+    Damaged rows are left out, for example a last row that a killed run wrote only in part.
     """
     with open(path, newline='', encoding='utf-8', errors='replace') as file, suppress(csv.Error):
         for row in csv.DictReader(file):
@@ -206,8 +206,7 @@ def _valid_rows(path: str | Path) -> Iterator[tuple[dict[str, str], dict[str, fl
 class _Board:
     """A TensorBoard event file.
 
-    It is written without TensorBoard's own writers: an error in their thread would print a
-    traceback.
+    TensorBoard's own writers are not used, because an error in their thread prints a traceback.
     """
 
     def __init__(self, folder: Path, resumed_steps: int) -> None:

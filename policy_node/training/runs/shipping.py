@@ -44,7 +44,9 @@ def ship(
     threads: int = 0,
     name: str = BEST_FILE,
 ) -> bool:
-    """Evaluate an actor of a run; copy it with its files if its success rate is the higher one.
+    """Evaluate an actor of a run; copy it with its files if it is better than the shipped one.
+
+    The better actor has the higher success rate or, at equal rates, the higher mean return.
 
     Args:
         run: Folder of the run.
@@ -135,8 +137,8 @@ def _write(
 ) -> None:
     """Write the shipped actor with its critic, curve and evaluation: all files or none.
 
-    Without a training state, the critic of the former actor is removed. The curve of a mean of
-    networks is written only if none exists.
+    If `state` is missing, the critic of the former actor is removed. An actor that is a mean of
+    several networks has no curve of its own, so an existing curve stays.
     """
     files = {target: actor}
     if state is not None:

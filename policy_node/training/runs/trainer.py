@@ -70,7 +70,7 @@ class Collected:
     Attributes:
         train_success: Success rate of these episodes, with exploration noise.
         evaluation: Outcomes of the evaluation; None if none was due.
-        evaluated: The evaluated actor.
+        evaluated: The evaluated actor; None without an evaluation.
         others: Success rates of further policies, by column of `progress.csv`.
     """
 
@@ -137,7 +137,8 @@ class BaseTrainer:
     def _outcomes(self, policy: Policy, to_beat: float = -1.0) -> EpisodeOutcomes:
         """Evaluate a policy on the same episodes each time.
 
-        The evaluation ends early once the success `to_beat` is above the 95 % interval.
+        The evaluation ends early once the success rate `to_beat` is above the 95 % interval of this
+        policy.
         """
         rule = self.config.success_rule
 
@@ -233,8 +234,8 @@ class Trainer(BaseTrainer):
     def resume(self, path: Path) -> None:
         """Continue from the training state in the file `path` and the replay beside it.
 
-        If the replay is missing, the run first collects as many episodes. They do not count as
-        steps.
+        If the replay is missing, the run first refills it with new episodes, which do not count as
+        environment steps.
 
         Raises:
             ValueError: If the file does not fit the configuration.
@@ -266,7 +267,7 @@ class Trainer(BaseTrainer):
             )
 
     def _let_critic_learn_first(self) -> None:
-        """Let the critics learn alone for `CRITIC_FIRST` updates if some of them started random.
+        """Let the critics learn alone for `CRITIC_FIRST` updates if some of them started untrained.
 
         A `critic_first` in the configuration has priority.
         """
@@ -319,7 +320,7 @@ class Trainer(BaseTrainer):
     def _run_cycle(
         self, collected: Collected, executor: ThreadPoolExecutor, log: RunLog | None
     ) -> Collected:
-        """Learn from the episodes of one cycle and collect those of the next; return the latter.
+        """Learn from the episodes of one cycle; collect and return the episodes of the next cycle.
 
         With `overlap`, both happen at the same time.
         """
@@ -364,7 +365,7 @@ class Trainer(BaseTrainer):
             )
 
     def _collect_first(self, executor: ThreadPoolExecutor) -> Collected | None:
-        """Collect episodes until the replay of a resumed run is filled; return one more cycle.
+        """Collect until the replay of a resumed run is refilled; return one more cycle of episodes.
 
         Return None if the run is stopped before.
         """
@@ -381,7 +382,7 @@ class Trainer(BaseTrainer):
     def _prepare_collection(self, may_evaluate: bool = True) -> tuple[Policy, Candidate | None]:
         """Set the exploration noise; return the policy that collects, and the actor to evaluate.
 
-        The actor is None if no evaluation is due, or `may_evaluate` is False.
+        Without a due evaluation, or if `may_evaluate` is False, None takes the place of the actor.
         """
         counters, steps = self.counters, self.counters.env_steps
         self.collector.exploration = self._exploration()
@@ -392,9 +393,9 @@ class Trainer(BaseTrainer):
         return policy, candidate
 
     def _candidate(self) -> Candidate | None:
-        """Return the actor to evaluate, and policies to evaluate for `progress.csv` only.
+        """Return the actor to evaluate and further policies; None on all workers but the first.
 
-        None except on the first worker.
+        The success of the further policies appears only in `progress.csv`.
         """
         if not self.workers.is_first:
             return None
@@ -412,7 +413,7 @@ class Trainer(BaseTrainer):
         return replace(collected, evaluation=outcomes, evaluated=actor, others=rates)
 
     def _exploration(self) -> float:
-        """Return the factor on exploration noise and random actions for now, 0 ... 1."""
+        """Return the present factor on exploration noise and random actions, 0 ... 1."""
         left = 3.0 * (1.0 - self._progress())
         final = self.config.final_exploration
         return final + (1.0 - final) * min(max(left, 0.0), 1.0)

@@ -34,7 +34,7 @@ _ADAM = {'step', 'exp_avg', 'exp_avg_sq'}
 
 @dataclass(slots=True)
 class Counters:
-    """The progress of a run since its first start, also over interruptions.
+    """The progress of a run since its first start, including the time before interruptions.
 
     Attributes:
         env_steps: Environment steps of all workers.
@@ -124,7 +124,7 @@ def state_bytes(state: TrainingState) -> bytes:
 def require_readable(learner: ActorCritic) -> None:
     """Raise ValueError if the networks would make files that are too large to be read again.
 
-    This is checked before hours of training.
+    The trainer calls this before it trains for hours.
     """
     actor = sum(value.nbytes for value in learner.actor.state_dict().values())
     modules, optimizers = learner.modules().values(), learner.optimizers().values()
@@ -197,7 +197,7 @@ def _counters(values: Any) -> Counters:
 
 
 def is_finite(value: object) -> TypeGuard[int | float]:
-    """Return whether a value is a finite number; a bool counts as no number."""
+    """Return whether a value is a finite number; booleans are not numbers."""
     return isinstance(value, int | float) and type(value) is not bool and math.isfinite(value)
 
 
@@ -223,10 +223,10 @@ def load_state(path: Path, learner: ActorCritic, modules: dict[str, nn.Module]) 
 
 @contextmanager
 def fitting(source: object) -> Iterator[None]:
-    """Turn errors from loading tensors into a one-line ValueError that names `source`.
+    """Turn errors of the block, which loads tensors, into a ValueError that names `source`.
 
     Raises:
-        ValueError: If the tensors do not fit.
+        ValueError: If the tensors do not fit; the message is one line.
     """
     try:
         yield
@@ -242,8 +242,8 @@ def fitting(source: object) -> Iterator[None]:
 def load_networks(tensors: dict[str, Tensor], modules: dict[str, nn.Module]) -> None:
     """Load tensors into networks and statistics.
 
-    Target networks and the averaged actor may be missing: they become copies. If the critic is
-    missing, the module keeps its weights.
+    Missing target networks and a missing averaged actor become copies of actor and critic. If the
+    critic is missing, its module keeps its weights.
 
     Raises:
         RuntimeError: If sizes do not fit or a part is incomplete.
@@ -265,7 +265,7 @@ def part_of(tensors: dict[str, Tensor], part: str) -> dict[str, Tensor]:
 
 
 def _with_copies(tensors: dict[str, Tensor], modules: Iterable[str]) -> dict[str, Tensor]:
-    """Add missing target networks and the averaged actor as copies of actor and critic.
+    """Add missing target networks and a missing averaged actor as copies of actor and critic.
 
     `modules` are the names of the parts that a run needs.
     """

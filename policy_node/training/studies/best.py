@@ -1,4 +1,4 @@
-"""The study `best`: the best recipe of every task, some starting from networks of another."""
+"""The study `best`: train each task with its best recipe, some from networks of another task."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ _OVERLAPPING = {'overlap': True, 'precision': 'auto'}
 
 
 def _start(task: str) -> Start:
-    """Return the task and fields whose trained networks `task` starts from."""
+    """Return the task whose networks `task` starts from, and fields for training them on."""
     coarse = _COARSE_FIRST if task_spec(task).position_counts else {}
     held = _HELD if 'Pen' in task else {}
     return Start(_STARTS_FROM[task], {**_FINE_TUNING, **coarse, **held})

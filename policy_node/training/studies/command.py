@@ -100,7 +100,7 @@ def _whole(text: str) -> int:
 
 
 def find_study(name: str) -> Study:
-    """Return a study of this package or of a module.
+    """Return the study `name`: one of this package, or `module:NAME`.
 
     Raises:
         ArgumentTypeError: If the name is unknown, or the module fails.
@@ -239,7 +239,10 @@ def _place(
 
 
 def _ship_all(options: argparse.Namespace, jobs: Sequence[Job], output: Path, report: Path) -> bool:
-    """Evaluate the best actors and copy the better ones; return whether nothing failed."""
+    """Evaluate the best actor of each job; copy those that beat the shipped ones.
+
+    Return False if an evaluation or a copy failed.
+    """
     actors, whole = options.actors or output / 'actors', True
     for job in jobs:
         if not (job.folder / BEST_FILE).is_file():

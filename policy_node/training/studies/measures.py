@@ -31,7 +31,7 @@ _MOST_SIMULATIONS = 64
 
 @dataclass(frozen=True, slots=True)
 class Curve:
-    """Deterministic evaluations of one run.
+    """The success of one run over its environment steps, evaluated without noise.
 
     Attributes:
         env_steps: (n,) ascending, in units of 40 ms.
@@ -50,9 +50,9 @@ class Curve:
 def measure_run(job: Job, command: str) -> dict[str, Any]:
     """Measure a trained job on fresh episodes and return its line of `runs.jsonl`.
 
-    Without an evaluation of 0.9, `steps_to_0.9` is None: the run is censored at its budget.
-    `parts` counts how often the run was started; a run with several parts differs from an
-    uninterrupted one in its resets.
+    If no evaluation reached 0.9, `steps_to_0.9` is missing (null), and the run is censored at its
+    budget. `parts` counts how often the run was started. A resumed run has other resets than an
+    uninterrupted one.
 
     Raises:
         ValueError: If the log has no evaluation or a file of the run is damaged.
@@ -94,7 +94,7 @@ def measure_run(job: Job, command: str) -> dict[str, Any]:
 
 
 def _final_success(job: Job) -> float | None:
-    """Return the success of the last actor on fresh episodes, the same for every run."""
+    """Return the success of the last actor on fresh episodes, which all runs share."""
     episodes, config = job.final_episodes, job.config
     if not episodes:
         return None
@@ -135,8 +135,9 @@ def sum_up(runs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Return medians and quartiles over the seeds of one variant: one row of `arms.csv`.
 
     Args:
-        runs: Stored runs with `area_in_time`. If it is None, the baseline has no run on the same
-            machine. `timed` counts the other runs; only these have measures of time.
+        runs: Stored runs with `area_in_time`, which a run lacks (None) without a run of the
+            baseline on the same machine. The result `timed` counts the runs that have it; only
+            these are used for measures of time.
     """
     first, name_of_steps = runs[0], f'steps_to_{GOOD_SUCCESS}'
     timed = [run for run in runs if run['area_in_time'] is not None]
@@ -156,7 +157,7 @@ def sum_up(runs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def _quartiles(name: str, values: Sequence[float]) -> dict[str, float | str]:
-    """Return median and quartiles by name; empty without values."""
+    """Return median and quartiles by column of `arms.csv`; the columns are empty without values."""
     parts = ('lower', 'median', 'upper')
     if not values:
         return {f'{name}_{part}': '' for part in parts}
@@ -167,8 +168,8 @@ def _quartiles(name: str, values: Sequence[float]) -> dict[str, float | str]:
 def is_significant(arm: Mapping[str, Any], baseline: Mapping[str, Any], name: str) -> bool:
     """Return whether two variants differ: disjoint quartiles and p of at most .05.
 
-    Disjoint quartiles alone are too easy: two equal variants of five seeds have them in 52 of the
-    252 possible orders.
+    Disjoint quartiles alone are too weak a test: two equal variants of five seeds have them in 52
+    of the 252 possible orders.
     """
     below = arm[f'{name}_upper'] < baseline[f'{name}_lower']
     above = baseline[f'{name}_upper'] < arm[f'{name}_lower']

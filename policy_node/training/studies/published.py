@@ -1,7 +1,7 @@
 """Tables of shipped actors, and published success rates beside which results are shown.
 
-The paper gives curves but no numbers. Instead, `RERUN` has re-runs of its code, configuration and
-budget by others, and `BEST` the best known result of any method.
+The paper gives curves but no numbers. So `RERUN` contains results of others, who ran its code and
+configuration again at about its budget. `BEST` contains the best known results of any method.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class Published:
 
     Attributes:
         success: Success at the last step, as text.
-        kind: `exact`, `quoted` or `figure`.
+        kind: How it was read: `exact`, `quoted` (second-hand) or `figure` (off a figure).
     """
 
     success: str
@@ -96,7 +96,7 @@ def actors_table(actors: Path) -> str:
 
 
 def actors_summary(actors: Path) -> str:
-    """Return `actors_table` in five short columns, without sources.
+    """Return a short form of `actors_table` with five columns.
 
     Raises:
         ValueError: If a file is no evaluation of an actor; the message names the file.

@@ -40,7 +40,7 @@ Bands = Mapping[str, Mapping[str, 'Band']]
 
 @dataclass(frozen=True, slots=True)
 class Band:
-    """Median and quartiles over seeds on common steps, each (n,)."""
+    """Median and quartiles of success over seeds at the same environment steps, each (n,)."""
 
     env_steps: Array
     median: Array
@@ -51,7 +51,7 @@ class Band:
 def write_study(study: Study, output: Path) -> None:
     """Write the tables and the figure of a study from the runs in its folder.
 
-    `arms.csv` holds medians and quartiles. `README.md` keeps the user's text around the table.
+    `arms.csv` holds medians and quartiles. Text of the user around the table in `README.md` stays.
 
     Raises:
         ValueError: If a stored run cannot be read.
@@ -73,7 +73,7 @@ def write_study(study: Study, output: Path) -> None:
 
 
 def sum_up_arms(study: Study, runs: Sequence[Run]) -> list[dict[str, Any]]:
-    """Return the rows of `arms.csv`: by task, in the order of the study's variants."""
+    """Return the rows of `arms.csv`, grouped by task, in the order of the study's variants."""
     first = study.arms[0].name
     order = [arm.name for arm in study.arms]
     rows = []
@@ -93,7 +93,7 @@ def sum_up_arms(study: Study, runs: Sequence[Run]) -> list[dict[str, Any]]:
 
 
 def arms_csv(arms: Sequence[Mapping[str, Any]]) -> bytes:
-    """Return the contents of `arms.csv`."""
+    """Return the rows of `sum_up_arms` as the contents of `arms.csv`."""
     return to_csv(list(arms[0]), (list(row.values()) for row in arms))
 
 
@@ -105,11 +105,11 @@ def _grouped(runs: Sequence[Run], name: str) -> dict[str, list[Run]]:
 
 
 def _timed(run: Run, seconds: Mapping[str, float]) -> Run:
-    """Add `area_in_time`: the mean success within the time that the baseline needs.
+    """Return a run with `area_in_time`, its mean success in the time that the baseline needs.
 
     Args:
-        seconds: Median processor time of the baseline, by machine. On other machines
-            `area_in_time` is None.
+        seconds: Median processor time of the baseline, by machine. For a run on another machine,
+            `area_in_time` becomes None.
     """
     known = seconds.get(run['machine'])
     return {**run, 'area_in_time': None if known is None else area_in_time(run, known)}
@@ -125,7 +125,7 @@ def _bands(runs: Sequence[Run]) -> dict[str, dict[str, Band]]:
 def aggregate(curves: Sequence[Curve]) -> Band:
     """Return median and quartiles over the steps that all curves cover.
 
-    Resumed runs are evaluated at other steps; curves are linear between evaluations.
+    Resumed runs are evaluated at other steps, so values between evaluations are interpolated.
     """
     first = max(float(curve.env_steps[0]) for curve in curves)
     last = min(float(curve.env_steps[-1]) for curve in curves)
@@ -199,7 +199,7 @@ def _quartiles(row: Mapping[str, Any], name: str) -> str:
 
 
 def _with_table(page: str, table: str) -> bytes:
-    """Replace the table between the marks of a page; without marks the page stays as it is."""
+    """Return a page with `table` between its marks; without marks it is unchanged."""
     text = page or f'{BEGIN}\n{END}\n'
     if BEGIN in text and END in text:
         before, after = text.split(BEGIN)[0], text.split(END, 1)[1]
@@ -208,13 +208,13 @@ def _with_table(page: str, table: str) -> bytes:
 
 
 def draw(bands: Bands, labels: Mapping[str, str]) -> bytes:
-    """Return a PNG: the median of each variant over its quartiles.
+    """Return a PNG with the median and the quartiles of each variant.
 
-    A task has one panel. A task with more than `_MOST_LINES` variants has one panel for each
-    variant but the first, the baseline, which every one of these panels shows as well.
+    A task has one panel. If it has more than `_MOST_LINES` variants, each variant has a panel of
+    its own, which also shows the first variant, the baseline.
 
     Args:
-        labels: By variant, in the order of their colours; the baseline first.
+        labels: Label of each variant, the baseline first. The order determines the colours.
     """
     from matplotlib.figure import Figure
     from matplotlib.ticker import EngFormatter
@@ -272,7 +272,7 @@ def _add_legend(figure: Any, panels: Sequence[Any], columns: int) -> None:
 
 
 def _top_of_axis(bands: Bands) -> float:
-    """Return the upper limit of the success axis: 1, or less if no variant reaches .5."""
+    """Return the upper limit of the success axis: 1, or less if all quartiles are at most .4."""
     # Curves without a common step have an empty band.
     tops = [band.upper for arms in bands.values() for band in arms.values() if band.upper.size]
     highest = max((float(upper.max()) for upper in tops), default=0.0)

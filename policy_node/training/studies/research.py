@@ -1,6 +1,6 @@
-"""The studies, as data: the paper's comparison, nine requests for research, one about the recipe.
+"""Definitions of the studies: the paper's comparison, nine requests for research, one recipe study.
 
-Settings are those of the `best` recipe, or of another named one, except for the values here.
+The settings are changes to the recipe `best`, or to the recipe that a study names.
 """
 
 from __future__ import annotations
@@ -102,7 +102,7 @@ _IN_BFLOAT16 = 'HandReach', 'HandManipulateBlockRotateZ', 'HandManipulateEggRota
 
 
 def _paper_settings(task: str) -> dict[str, Any]:
-    """Return the settings of a task: about a quarter of an hour of one core per run.
+    """Return the settings of a task, for runs of about a quarter of an hour on one core.
 
     Fetch tasks have 1.2 % (FetchReach) or 32 % of the paper's steps and smaller batches. One
     collection of 76 episodes replaces two of 38, with twice the updates. Targets move every 10
@@ -128,7 +128,7 @@ def _paper_settings(task: str) -> dict[str, Any]:
 
 
 def _returns() -> Iterator[Arm]:
-    """Yield one step, and longer returns with each correction."""
+    """Yield variants with one-step returns, and with longer returns for each `correction`."""
     yield _arm('one', 'one step', n_step=1)
     for steps, correction in product((3, 5, 10), ('none', 'lambda', 'cut')):
         label = f'{steps} steps, correction {correction}'
@@ -136,7 +136,7 @@ def _returns() -> Iterator[Arm]:
 
 
 def _targets() -> Iterator[Arm]:
-    """Yield targets at four intervals, and no targets with three normalisations."""
+    """Yield variants with target networks, and without them for each normalisation."""
     slow: dict[str, Any] = {'target': 'polyak', 'target_update_interval': 10}
     for updates in (10, 1, 4, 40):
         label = f'target moves every {updates} updates'
@@ -147,7 +147,7 @@ def _targets() -> Iterator[Arm]:
 
 
 def _ensembles() -> Iterator[Arm]:
-    """Yield variants of the critic: one, ensembles by aggregation, quantiles, more updates."""
+    """Yield variants with one critic, ensembles, quantiles or more updates."""
     yield _arm('one', 'one critic', critics=1)
     for number, pooling in ((2, 'mean'), (2, 'min'), (5, 'mean'), (5, 'min'), (5, 'truncated')):
         label = f'{number} critics, {pooling}'
@@ -164,7 +164,7 @@ def _ensembles() -> Iterator[Arm]:
 
 
 def _rates() -> Iterator[Arm]:
-    """Yield the recipe at 250, 125 and 25 Hz, and remedies at 250 Hz."""
+    """Yield the recipe at 250, 125 and 25 Hz, and changes that may help at 250 Hz."""
     for rate in (250, 125, 25):
         label = f'{rate} Hz, as it is'
         yield _arm(f'plain{rate}', label, control_hz=float(rate), discount='tick')

@@ -1,7 +1,7 @@
 """The finished runs of a study, one JSON object per line in `runs.jsonl` of its report folder.
 
-The file only grows; of two lines about the same run the later one counts. Tables and figures are
-derived from it.
+Lines are only added. If two lines describe the same run, the later one counts. Tables and figures
+are derived from this file.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ Runs = dict[tuple[str, str, int], Run]
 
 
 def read_runs(folder: Path) -> Runs:
-    """Read the runs of a report folder; without a file there are none.
+    """Read the runs of a report folder; the result is empty without a file `runs.jsonl`.
 
     Raises:
-        ValueError: If a line is no run.
+        ValueError: If a line of the file is no run.
     """
     runs: Runs = {}
     file = folder / RUNS
@@ -46,10 +46,10 @@ def read_runs(folder: Path) -> Runs:
 
 
 def add_run(folder: Path, run: Mapping[str, Any]) -> None:
-    """Append a run.
+    """Append a run to the file `runs.jsonl` of a report folder.
 
     Raises:
-        OSError: If the disk is full; the file is as before.
+        OSError: If writing fails, for example on a full disk. The file is unchanged.
     """
     file, line = folder / RUNS, json.dumps(run, separators=(',', ':'))
     with alone_in(folder):
@@ -69,7 +69,7 @@ def in_order(runs: Iterable[Run], study: Study) -> list[Run]:
 
 
 def holds(runs: Runs, job: Job) -> bool:
-    """Return whether the runs include this job, with its configuration and final evaluation."""
+    """Return whether `runs` has this job with equal configuration and final episodes."""
     run = runs.get(job.key)
     if run is None or run['final_episodes'] != job.final_episodes:
         return False

@@ -1,7 +1,7 @@
-"""A study: its question, its variants and its budget, and the training runs that these make.
+"""A study: its question, its variants, its budget and its training runs.
 
-All variants of a study share task, budget and settings and differ in `changes` only. Every run is
-an ordinary training: on one thread the same seed gives the same bits.
+All variants of a study share tasks and settings and differ only in `changes` and `factors`. On one
+thread, runs with equal seeds give bit-identical results.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class Arm:
         name: Name in folders and on the command line.
         label: Name in figures and tables.
         changes: Fields of `TrainConfig` that only this variant sets.
-        factors: Whole-numbered fields and how many times the common value this variant has.
+        factors: Integer fields, and the factor by which this variant multiplies their common value.
     """
 
     name: str
@@ -77,7 +77,7 @@ class Start:
 
     Attributes:
         task: The task whose run trains them, earlier in the study.
-        fields: Fields of `TrainConfig` that preserve them.
+        fields: Fields of `TrainConfig` for the runs that start from them.
     """
 
     task: str
@@ -96,7 +96,8 @@ class Study:
             They replace fields of the recipe `best`, or of the recipe that they name.
         arms: The variants; the first is the baseline.
         seeds: Default number of seeds.
-        starts: By task, the networks it starts from; random ones if that task is not trained too.
+        starts: Networks that the runs of a task start from, by task. If the task that trains them
+            is not selected, the networks are random.
         ships: Whether the best actors are evaluated and copied, instead of comparing runs.
     """
 
@@ -139,9 +140,10 @@ class Study:
         output: Path,
         episodes: int = FINAL_EPISODES,
     ) -> list[Job]:
-        """Return the runs by task, then seed by seed: a stopped study has as many of each variant.
+        """Return the jobs, sorted by task, then seed, then variant.
 
-        Step counts scale with the action frequency: equal budgets in simulated time.
+        So a study that is stopped early has about equally many runs of each variant. Step counts
+        are scaled with the action frequency, so that all runs have equal simulated time.
 
         Args:
             overrides: Fields of `TrainConfig` for all runs.
@@ -203,24 +205,24 @@ class Job:
 
     @property
     def has_checkpoint(self) -> bool:
-        """True if a training can continue."""
+        """True if the folder contains a training state from which to continue."""
         return (self.folder / STATE_FILE).is_file()
 
     @property
     def is_trained(self) -> bool:
-        """True if the saved state has all steps. The log may be ahead of it."""
+        """True if the training state has all steps; the log may already contain later rows."""
         if not self.has_checkpoint:
             return False
         return read_counters(self.folder / STATE_FILE).env_steps >= self.config.total_steps
 
     @property
     def is_ready(self) -> bool:
-        """True if the start networks exist."""
+        """True if the job can start: networks from another job are trained, or not needed."""
         return self.after is None or self.has_checkpoint or self.after.is_trained
 
     @property
     def status(self) -> str:
-        """One line of progress."""
+        """The progress of the run in one line: steps, last success and remaining time."""
         log, total = self.folder / PROGRESS_FILE, self.config.total_steps
         rows = read_progress(log) if log.is_file() else []
         evaluated = [row['eval_success'] for row in rows if 'eval_success' in row]
@@ -231,10 +233,10 @@ class Job:
         return f'{self.name}: {steps:,.0f} of {total:,} steps, eval {success}, ETA {left}'
 
     def check_configuration(self) -> None:
-        """Reject a folder that contains a run with another configuration.
+        """Check that the folder contains no run with another configuration.
 
         Raises:
-            ValueError: The message names the fields.
+            ValueError: If it does; the message names the fields that differ.
         """
         if not self.has_checkpoint:
             return
@@ -256,7 +258,7 @@ def to_settings(config: TrainConfig) -> dict[str, Any]:
 
 
 def differing_fields(stored: Mapping[str, Any], config: TrainConfig) -> dict[str, str]:
-    """Return the differing fields that change the result, each with both values in words.
+    """Return the fields that differ and change the result, each with a text of both values.
 
     Args:
         stored: A configuration from `to_settings`; missing fields have their default.

@@ -72,11 +72,12 @@ def run_jobs(
     Args:
         jobs: All jobs, the most important first.
         place: The place where they run.
-        when_finished: Renews the report; a failure does not end the running jobs.
+        when_finished: Called after each finished job to update the report. If it fails, the jobs
+            continue.
 
     Returns:
-        0 if all finished, 1 if not; if a signal stopped a job, 128 + its number. No further job
-        starts then.
+        0 if all jobs finished, else 1. If a signal stopped a job, no further job starts, and the
+        result is 128 + the number of the signal.
     """
     waiting = [job for job in jobs if not is_finished(job, report)]
     running, left, stopped = 0, len(waiting), 0
@@ -146,7 +147,7 @@ class ThisProcess:
         self._ended: list[tuple[Job, int]] = []
 
     def start(self, job: Job) -> None:
-        """Run the job."""
+        """Run the job to its end."""
         self._ended.append((job, attempt(job, self._report, self._command)))
 
     def wait(self) -> tuple[Job, int]:
@@ -157,8 +158,8 @@ class ThisProcess:
 class Processes:
     """Run several jobs at once, each in a process that prints into `log.txt` of its run.
 
-    Ctrl-C and SIGTERM reach the processes as SIGTERM: they finish their cycle and save their state,
-    as they do if this process is killed. A second signal ends them at once.
+    Ctrl-C and SIGTERM are passed on to the processes as SIGTERM. They then finish their cycle and
+    save their state, as they do if this process is killed. A second signal ends them at once.
     """
 
     def __init__(self, limit: int, report: Path, command: str) -> None:
@@ -224,7 +225,7 @@ class Processes:
 
 
 def _work(job: Job, report: Path, command: str) -> None:
-    """Train and measure one job: the function that each process of `Processes` runs."""
+    """Train and measure one job, in one of the processes of `Processes`."""
     # In the group of the parent, Ctrl-C would arrive twice. The session stays the same: Linux
     # schedules by session, so `nice` would have no effect in another.
     os.setpgid(0, 0)
