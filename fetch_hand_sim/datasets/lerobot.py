@@ -1,7 +1,7 @@
 """Write logged episodes as a LeRobot dataset, format 3.0, for imitation learning.
 
-Needs pyarrow (the extra `[data]`), not lerobot itself, whose pins exclude other versions of torch.
-Files equal those of `LeRobotDataset.create` and `save_episode` in lerobot 0.4.4.
+Needs pyarrow (the extra `[data]`) but not lerobot, which restricts the version of torch. The files
+equal those that `LeRobotDataset.create` and `save_episode` of lerobot 0.4.4 write.
 """
 
 from __future__ import annotations
@@ -37,22 +37,24 @@ Row = dict[str, Any]
 def export_lerobot(
     by_task: ByTask, directory: Path, camera: Camera | None = None
 ) -> dict[str, Path]:
-    """Write the episodes of each task as a dataset, N frames an episode, all of them or none.
+    """Write one dataset for each task; an episode of N steps has N frames.
 
     A frame has `observation.state` (the robot), `observation.environment_state` (the object, then
-    the desired goal), `action`, and its results `next.reward`, `next.success` and `next.done`. All
-    are float32, as LeRobot's policies expect.
+    the desired goal), `action`, and its results `next.reward`, `next.success` and `next.done`.
+    Observations, actions and rewards are float32, as LeRobot's policies expect.
 
     Args:
-        by_task: Episodes, at least one of each task, each with a step and the settings of the first
-            of its task, see `writing.why_apart`.
+        by_task: At least one episode of each task. Each has at least one step and can share a
+            dataset with the first one of its task, see `writing.why_apart`.
+        directory: Folder for the datasets.
+        camera: Camera of the films; None writes no films.
 
     Returns:
-        The dataset of each task, `directory/<task>`, for `LeRobotDataset('me/<task>', root=...)`.
+        The folder of each dataset, `directory/<task>`: `LeRobotDataset('me/<task>', root=folder)`.
 
     Raises:
-        ExportError: If pyarrow is missing, or a dataset exists or cannot be written; none is
-            created.
+        ExportError: If pyarrow is missing, or a dataset exists or cannot be written. Then no
+            dataset is created.
         ValueError: If a model has no such camera, or ffmpeg is missing for a film.
         RuntimeError: If there is no OpenGL to draw with.
     """
@@ -66,7 +68,7 @@ def export_lerobot(
 
 @dataclass(frozen=True, slots=True)
 class _Dataset:
-    """A dataset that is being written."""
+    """Writes the LeRobot dataset of one task into the folder `path`."""
 
     path: Path
     spec: TaskSpec
@@ -99,7 +101,7 @@ class _Dataset:
         self._write_json('meta/info.json', self._info(rows))
 
     def _row(self, columns: Columns, where: dict[str, int]) -> Row:
-        """Return the row of an episode in `meta/episodes`."""
+        """Return the row of an episode for `meta/episodes`; `where` is its data file."""
         index = columns['index']
         return {
             'episode_index': int(columns['episode_index'][0]),
@@ -120,7 +122,7 @@ class _Dataset:
         rows: Sequence[Row],
         where: dict[str, int],
     ) -> list[Histogram]:
-        """Write one film file of several episodes; add file and times to their rows."""
+        """Write the episodes of one data file as one film, and add their place in it to `rows`."""
         path = self._file(_FILM, video_key=camera.key, **where)
         colors = write_episodes(path, episodes, camera, self.rate)
         begins = accumulate((row['length'] for row in rows), initial=0)
@@ -174,7 +176,7 @@ class _Dataset:
 
 
 def _files(episodes: Sequence[Columns]) -> Iterator[list[Columns]]:
-    """Divide the episodes among files of limited size."""
+    """Yield groups of episodes, each small enough for one data file."""
     group: list[Columns] = []
     size = 0
     for columns in episodes:
@@ -188,7 +190,7 @@ def _files(episodes: Sequence[Columns]) -> Iterator[list[Columns]]:
 
 
 def _column(values: NDArray[Any]) -> Any:
-    """Convert an array to an Arrow column: numbers for (n,) and (n, 1), else fixed-size lists."""
+    """Convert an array to an Arrow column of numbers, or of lists of fixed size for (n, size)."""
     pyarrow = require_module('pyarrow')
     flat = pyarrow.array(values.ravel())
     if values.ndim == 1 or values.shape[1] == 1:
@@ -206,7 +208,7 @@ def _flat(found: Row) -> Row:
 
 
 def _tasks(spec: TaskSpec) -> Any:
-    """Return the table of the one task; pandas reads the names as its index."""
+    """Return the table of tasks, with one row; pandas uses the task name as its index."""
     names = '__index_level_0__'
     number = {'pandas_type': 'int64', 'numpy_type': 'int64', 'metadata': None}
     name = {'pandas_type': 'unicode', 'numpy_type': 'object', 'metadata': None}
@@ -235,7 +237,7 @@ _COUNTS = ('frame_index', 'episode_index', 'index', 'task_index')
 
 
 def features(spec: TaskSpec) -> dict[str, dict[str, Any]]:
-    """Return type, shape and names of the columns, as in `meta/info.json`."""
+    """Return type, shape and value names of each column, as `meta/info.json` contains them."""
     robot, rest = _parts(spec)
     goal = [f'desired_goal_{index}' for index in range(spec.goal.size)]
     return {
@@ -265,7 +267,10 @@ def _parts(spec: TaskSpec) -> tuple[list[str], list[str]]:
 
 
 def frames(episode: EpisodeArrays, episode_index: int, first_index: int) -> Columns:
-    """Return the columns of the N frames of an episode, one per action."""
+    """Return the columns of the N frames of an episode, one frame per action.
+
+    `first_index` is the number of the first frame in the dataset.
+    """
     spec, count = episode.spec, len(episode)
     seen = episode.observations['observation'][:count]
     of_object = np.repeat(
@@ -290,7 +295,7 @@ def frames(episode: EpisodeArrays, episode_index: int, first_index: int) -> Colu
 
 
 def statistics(values: NDArray[Any]) -> dict[str, Any]:
-    """Return the statistics of frames (n,) or (n, size) for normalisation; each is a list."""
+    """Return minimum, maximum, mean and other statistics of a column (n,) or (n, size)."""
     rows = values.reshape(len(values), -1)
     numbers = rows.astype(np.float64)
     return {
@@ -309,7 +314,7 @@ def statistics(values: NDArray[Any]) -> dict[str, Any]:
 
 
 def quantile_name(share: float) -> str:
-    """Return the name of a quantile, such as `q50`."""
+    """Return the name of a quantile: `q50` for a share of 0.5."""
     return f'q{round(100 * share):02d}'
 
 
@@ -327,8 +332,8 @@ class Camera:
     """The camera of the films of a dataset.
 
     Attributes:
-        width: Width of pictures, pixels; even, because of H.264.
-        height: Height, likewise.
+        width: Width of pictures, pixels, an even number for H.264.
+        height: Height of pictures, pixels, an even number for H.264.
         name: Name of a camera of the model; None for the usual view.
     """
 
@@ -338,11 +343,11 @@ class Camera:
 
     @property
     def key(self) -> str:
-        """The name of the column."""
+        """The name of the dataset's column with the pictures of this camera."""
         return f'observation.images.{self.name or "scene"}'
 
     def feature(self, rate: float) -> dict[str, Any]:
-        """Return the column as in `meta/info.json`, for `rate` pictures per second."""
+        """Return the entry of this column in `meta/info.json`; `rate` is pictures per second."""
         return {
             'dtype': 'video',
             'shape': [self.height, self.width, 3],
@@ -363,10 +368,10 @@ class Camera:
 def write_episodes(
     path: Path, episodes: Sequence[EpisodeArrays], camera: Camera, rate: float
 ) -> list[Histogram]:
-    """Write a film of episodes, without the last frame of each, because no action follows it.
+    """Write several episodes as one film. Each lacks its last frame, which no action follows.
 
     Returns:
-        Number of pixels of each value by colour channel, (3, 256) for each episode.
+        A histogram (3, 256) of each episode: number of pixels by colour channel and level.
     """
     studio = Studio(camera.width, camera.height, camera.name)
     histograms = [np.zeros((3, _LEVELS), dtype=np.int64) for _ in episodes]
@@ -391,10 +396,10 @@ def _counted(
 
 
 def color_statistics(histogram: Histogram, pixels: int) -> dict[str, Any]:
-    """Return the statistics of pictures for normalisation: levels in [0, 1], each (3, 1, 1).
+    """Return the statistics of pictures per colour channel, (3, 1, 1), with levels in [0, 1].
 
     Args:
-        histogram: (3, 256) how often each level was drawn.
+        histogram: (3, 256) number of pixels by colour channel and level.
         pixels: Number of pixels of a picture.
     """
     levels = np.arange(_LEVELS) / (_LEVELS - 1)

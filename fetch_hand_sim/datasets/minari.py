@@ -1,6 +1,6 @@
 """Write logged episodes as Minari datasets.
 
-Needs the extra `[data]`. Values are those of `load_episodes`, float64, unchanged.
+Needs the extra `[data]`. The datasets contain the unchanged float64 values of `load_episodes`.
 """
 
 from __future__ import annotations
@@ -49,11 +49,11 @@ def dataset_name(text: str) -> str:
 
 
 def export_minari(by_task: ByTask, directory: Path, name: str) -> dict[str, str]:
-    """Write the episodes of each task as a Minari dataset, all of them or none.
+    """Write one Minari dataset for each task.
 
     Args:
-        by_task: Episodes, at least one of each task, with the settings of the first of its task,
-            see `writing.why_apart`.
+        by_task: At least one episode of each task. Each can share a dataset with the first one of
+            its task, see `writing.why_apart`.
         directory: Folder of the Minari datasets (`MINARI_DATASETS_PATH`).
         name: Name such as `logged-v0` or `me/logged-v0`; the task comes before it.
 
@@ -62,8 +62,8 @@ def export_minari(by_task: ByTask, directory: Path, name: str) -> dict[str, str]
 
     Raises:
         UsageError: If the name is not allowed.
-        ExportError: If minari is missing, the dataset exists or cannot be written. No dataset is
-            created in either case.
+        ExportError: If minari is missing, or a dataset exists or cannot be written. Then no
+            dataset is created.
     """
     versioned = dataset_name(name)
     for task in by_task:
@@ -87,7 +87,7 @@ def export_minari(by_task: ByTask, directory: Path, name: str) -> dict[str, str]
 def _buffers(
     collector: Any, episodes: Sequence[EpisodeArrays], advance: Callable[[int], None]
 ) -> Iterator[Any]:
-    """Yield the episodes as Minari's buffers."""
+    """Yield each episode as an `EpisodeBuffer` of Minari, then report one with `advance`."""
     for index, episode in enumerate(episodes):
         yield collector.EpisodeBuffer(
             id=index,
@@ -131,7 +131,7 @@ def _create_dataset(
 
 @contextmanager
 def _unmeasured() -> Iterator[None]:
-    """For the body, stop Minari from adding up all file sizes after every episode."""
+    """Stop Minari from adding up all file sizes after every episode, until the block ends."""
     storage = require_module('minari.dataset.minari_storage').MinariStorage
     measure = storage.get_size
     storage.get_size = lambda dataset: 0.0
@@ -143,7 +143,7 @@ def _unmeasured() -> Iterator[None]:
 
 @contextmanager
 def _minari_folder(directory: Path, dataset_ids: Iterable[str]) -> Iterator[None]:
-    """Let Minari write into a hidden folder; whole datasets move to their place at the end."""
+    """Let Minari write into a hidden folder; move its datasets to `directory` on success."""
     # Minari joins a relative path to itself.
     directory, before = directory.resolve(), os.environ.get(_MINARI_PATH)
     with appearing(directory, dataset_ids) as hidden:
@@ -166,7 +166,7 @@ def _minari_folder(directory: Path, dataset_ids: Iterable[str]) -> Iterator[None
 
 
 def _environment(episode: EpisodeArrays) -> Any:
-    """Return the spec of the environment of the episode, for `recover_environment`."""
+    """Return the spec from which Minari's `recover_environment` makes the environment."""
     register_environments()
     record = episode.record
     spec = copy.deepcopy(gymnasium.spec(environment_id(episode.spec.name)))

@@ -1,6 +1,6 @@
 """Write logged episodes as Parquet tables.
 
-Needs the extra `[data]`. Values are those of `load_episodes`, float64, unchanged.
+Needs the extra `[data]`. The tables contain the unchanged float64 values of `load_episodes`.
 """
 
 from __future__ import annotations
@@ -22,15 +22,17 @@ _OBSERVATIONS = ('observation', 'achieved_goal', 'desired_goal')
 
 
 def export_parquet(by_task: ByTask, directory: Path) -> dict[str, list[Path]]:
-    """Write the episodes of each task as two tables, all of them or none.
+    """Write two tables for each task.
 
-    `<task>.parquet` has N + 1 rows per episode, one per observation: `episode_index`, `step`,
-    `timestamp` in seconds since the reset, the three observations, then what happened after it:
-    `action`, `command`, `reward`, `terminated`, `truncated`, `next_success`, all null in the last
-    row. `<task>_episodes.parquet` has a row per episode with its metadata and result.
+    `<task>.parquet` has N + 1 rows for an episode of N steps, one per observation. The first
+    columns are `episode_index`, `step`, `timestamp` in seconds since the reset, and the three
+    observations. The columns of the step that follows are `action`, `command`, `reward`,
+    `terminated`, `truncated` and `next_success`. They are null in the last row of an episode.
+    `<task>_episodes.parquet` has a row per episode with its metadata and result.
 
     Raises:
-        ExportError: If pyarrow is missing, or a file exists or cannot be written; none is created.
+        ExportError: If pyarrow is missing, or a file exists or cannot be written. Then no file is
+            created.
     """
     pyarrow, parquet = require_module('pyarrow'), require_module('pyarrow.parquet')
     names = {task: (f'{task}.parquet', f'{task}_episodes.parquet') for task in by_task}
@@ -68,7 +70,7 @@ def _step_table(pyarrow: Any, index: int, episode: EpisodeArrays) -> Any:
 
 
 def _column(pyarrow: Any, values: NDArray[Any], rows: int) -> Any:
-    """Return a column of numbers, or of vectors of fixed size, filled with nulls to `rows`."""
+    """Convert an array (n,) or (n, size) to an Arrow column, extended with nulls to `rows`."""
     column = pyarrow.array(values.ravel())
     if values.ndim == 2:
         column = pyarrow.FixedSizeListArray.from_arrays(column, values.shape[1])

@@ -1,4 +1,4 @@
-"""Shared by all exports: whole datasets appear at once, and nothing is overwritten."""
+"""Helpers of all exports: a dataset appears only when complete, and nothing is overwritten."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ class ExportError(CommandError):
 
 
 def why_apart(episode: EpisodeArrays, first: EpisodeArrays) -> str:
-    """Return why an episode cannot be in a dataset with another of its task, '' if it can.
+    """Return why an episode cannot share a dataset with the episode `first`, or '' if it can.
 
-    A dataset of Minari has one environment, one of LeRobot has one rate, and rewards need one rule.
+    All episodes of a dataset have the same control rate, timing, reward type and success rule.
     """
     for name in _SETTINGS:
         if name == 'timing' and episode.record.control_hz == DEFAULT_CONTROL_HZ:
@@ -52,7 +52,7 @@ def require_module(module: str) -> Any:
 
 @contextmanager
 def alone_in(directory: Path) -> Iterator[None]:
-    """Make a folder and lock it against other processes until the end of the block."""
+    """Create a folder if it is missing, and lock it until the end of the block."""
     directory.mkdir(parents=True, exist_ok=True)
     descriptor = os.open(directory, os.O_RDONLY | os.O_DIRECTORY)
     try:
@@ -69,7 +69,7 @@ def appearing(directory: Path, names: Iterable[str]) -> Iterator[Path]:
     """Yield a hidden folder; its entries `names` move to `directory` at the end of the block.
 
     Raises:
-        ExportError: If one exists in `directory`, or the disk fails; nothing is written then.
+        ExportError: If `directory` already has an entry of such a name, or the disk fails.
     """
     targets = {name: directory / name for name in names}
     try:

@@ -34,12 +34,13 @@ class EpisodeArrays(HasOutcome):
         actions: (N, action size), normalised to [-1, 1].
         commands: (N, action size), applied commands, command units.
         rewards: (N,).
-        terminated: (N,): no task ends in a terminal state, so all False.
-        truncated: (N,): True at the last step, where time, divergence or an interruption ended it.
-        success: (N + 1,): whether the goal was reached.
+        terminated: (N,) always False, because no task has a terminal state.
+        truncated: (N,) True only at the last step: time was up, the simulation diverged, or the
+            episode was interrupted.
+        success: (N + 1,) whether the goal was reached.
         stamps: (N + 1,) simulated time, nanoseconds.
-        metadata: The metadata record `episode`; `record` is the same, parsed.
-        result: The metadata record `episode_result`; `outcome` is the same, parsed.
+        metadata: The metadata record `episode`; `record` contains its parsed values.
+        result: The metadata record `episode_result`; `outcome` contains its parsed values.
     """
 
     path: Path
@@ -68,14 +69,14 @@ class EpisodeArrays(HasOutcome):
 def load_episodes(
     path: Path | str, on_skip: Callable[[EpisodeReadError], None] | None = None
 ) -> list[EpisodeArrays]:
-    """Load one episode, or all of a directory of episodes, by name.
+    """Load one episode, or all episodes in a directory, sorted by name.
 
-    Interrupted episodes are included up to their last whole tick; `is_complete` marks them.
+    Interrupted episodes are included up to their last whole tick; their `is_complete` is False.
 
     Args:
-        path: A bag directory, an MCAP file, or a directory of either.
-        on_skip: Called with the error of each unreadable episode, which is left out; by default the
-            EpisodeReadError is raised.
+        path: A bag directory, an MCAP file, or a directory that contains several of these.
+        on_skip: Called with the error of each unreadable episode, which is left out. None raises
+            the first such EpisodeReadError.
     """
     return list(read_each(expand_episodes(path), load_episode, on_skip))
 
@@ -98,7 +99,7 @@ def _assembler(task: TaskSpec, control_hz: float) -> ObservationAssembler:
 
 
 def _decode(file: Episode) -> EpisodeArrays:
-    """Decode the topics of a file and join them by tick, or raise ValueError."""
+    """Decode the messages of an episode into arrays; ValueError if a message is missing."""
     record = EpisodeRecord.parse(file.metadata)
     task, assembler = record.task, _assembler(record.task, record.control_hz)
     names = [spec.name for spec in assembler.topics]
@@ -133,7 +134,7 @@ def _decode(file: Episode) -> EpisodeArrays:
 
 
 def stamped_vectors(file: Episode, task: TaskSpec, name: str, stamps: NDArray[np.int64]) -> Array:
-    """Return the vectors (N, size) of a topic with a message for each stamp, or ValueError."""
+    """Return the vectors (N, size) of a topic; ValueError unless its stamps are `stamps` (N,)."""
     given, vectors = _codec(task, name).decode_many(file.rows(name)[1][: len(stamps)])
     if not np.array_equal(given, stamps):
         raise ValueError(f'{name} is missing at some ticks')
@@ -143,7 +144,10 @@ def stamped_vectors(file: Episode, task: TaskSpec, name: str, stamps: NDArray[np
 def _unstamped_vectors(
     file: Episode, task: TaskSpec, name: str, stamps: NDArray[np.int64], first: int
 ) -> Array:
-    """Return the vectors of a topic without stamps; the log times tell their ticks."""
+    """Return the vectors of a topic without header stamps, from tick `first` on.
+
+    The log time of a message determines its tick; ValueError if one is missing.
+    """
     count = len(stamps) - first
     if not count:
         return np.zeros((0, topic(task, name).size))

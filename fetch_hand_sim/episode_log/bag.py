@@ -1,8 +1,8 @@
-"""Write MCAP files as rosbag2, rosbags and Foxglove expect them, and their `metadata.yaml`.
+"""Write MCAP files and their `metadata.yaml` as rosbag2, rosbags and Foxglove expect them.
 
-Profile `ros2`, `ros2msg` schemas, `cdr` messages, quality of service and type hash per channel,
-chunks with CRC and message index, schemas and channels repeated in the summary, statistics, CRC of
-all data.
+The files have the profile `ros2`, `ros2msg` schemas and `cdr` messages. Each channel records the
+quality of service and the type hash. Chunks have a CRC and message indexes. The summary repeats
+schemas and channels and contains statistics.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class Attachment:
 
 @cache
 def offered_qos(spec: QosSpec) -> list[dict[str, Any]]:
-    """Return the quality of service of one publisher as rosbag2 writes it."""
+    """Return the QoS profile of one publisher, with the keys that rosbag2 writes."""
     return [
         {
             'history': 'keep_last',
@@ -77,12 +77,12 @@ def offered_qos(spec: QosSpec) -> list[dict[str, Any]]:
 
 @cache
 def offered_qos_text(spec: QosSpec) -> str:
-    """Return `offered_qos` as YAML, for the channel of an MCAP file."""
+    """Return the QoS profile of one publisher as YAML text, as a channel of the file records it."""
     return yaml.safe_dump(offered_qos(spec), sort_keys=False)
 
 
 def checked_strings(content: Mapping[str, str]) -> dict[str, str]:
-    """Copy the contents of a metadata record; raise ValueError if readers would reject it."""
+    """Copy a metadata record; ValueError if it exceeds the limits of entries or bytes."""
     size = sum(len(text.encode()) for item in content.items() for text in item)
     if size > MAX_METADATA_BYTES:
         raise ValueError(f'{size} bytes of episode metadata; allowed: {MAX_METADATA_BYTES}')
@@ -93,7 +93,7 @@ def checked_strings(content: Mapping[str, str]) -> dict[str, str]:
 
 @dataclass(slots=True)
 class _Channel:
-    """A channel of the MCAP file: one topic under its full name."""
+    """A channel of the MCAP file; `name` is the full topic name, `count` the messages so far."""
 
     name: str
     topic: TopicSpec
@@ -102,10 +102,10 @@ class _Channel:
 
 
 class BagFile:
-    """One episode as an MCAP file in an open stream, which the caller flushes and closes.
+    """Writes one episode as an MCAP file into an open stream, which the caller closes.
 
-    An `OSError` of the stream is raised and ends the file. The records that identify the episode
-    are written at once, so that a cut-off file contains them.
+    An `OSError` of the stream is raised; nothing can be written after it. Metadata and attachments
+    are written first, so that a cut-off file also contains them.
     """
 
     def __init__(
@@ -149,7 +149,8 @@ class BagFile:
         Sequence numbers count the messages of a topic from 0, so a gap is visible.
 
         Raises:
-            OSError: If readers would reject the file; all earlier messages are flushed then.
+            OSError: If the message exceeds the limits of a file, or the stream fails. In the first
+                case all earlier messages are flushed.
         """
         if not self.has_room(len(data)):
             self.flush()
@@ -170,7 +171,7 @@ class BagFile:
         return self._flushes + self._bytes // CHUNK_BYTES + 1
 
     def has_room(self, size: int) -> bool:
-        """Return whether readers accept the file with one more message of `size` bytes."""
+        """Return whether the file stays within its limits with another message of `size` bytes."""
         return (
             size <= MAX_MESSAGE_BYTES
             and self.message_count < MAX_MESSAGES
@@ -179,7 +180,7 @@ class BagFile:
         )
 
     def flush(self) -> None:
-        """End the current chunk and write everything to the operating system."""
+        """End the current chunk and pass all data to the operating system, without fsync."""
         self._flushes += self.has_unflushed
         self.has_unflushed = False
         self._writer.flush()  # type: ignore[no-untyped-call]
@@ -216,7 +217,7 @@ class BagFile:
         return {'serialized_metadata': _dump(self._description(custom_data))}
 
     def _description(self, custom_data: Mapping[str, str]) -> dict[str, Any]:
-        """Return rosbag2's description of the bag; readers of version 9 need every key."""
+        """Return the contents of `metadata.yaml`; rosbag2's format version 9 needs every key."""
         span = {
             'starting_time': {'nanoseconds_since_epoch': self._start_ns},
             'duration': {'nanoseconds': max(self._end_ns, 0) - self._start_ns},
@@ -250,7 +251,7 @@ def _topic_entry(channel: _Channel) -> dict[str, Any]:
 
 
 class _Quoted(str):
-    """Text that is always quoted: a revision such as 12e4567 is a number to YAML 1.2."""
+    """Text that YAML quotes; unquoted, a revision such as 12e4567 would be read as a number."""
 
 
 class _Dumper(_SafeDumper):  # type: ignore[misc]

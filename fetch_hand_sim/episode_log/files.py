@@ -1,7 +1,7 @@
-"""Find episodes; create, lock, store and name their files.
+"""Find the files of episodes; create, lock and rename them.
 
-An episode is written in the hidden directory `.<name>.active`, which gets its name when it is
-complete. Recovery moves files without messages to `.<name>.aside`.
+An episode is written into the hidden directory `.<name>.active`. This directory is renamed to
+`<name>` when the episode is complete. Recovery moves files without messages to `.<name>.aside`.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class EpisodeLogError(RuntimeError):
 
 
 class EpisodeExistsError(EpisodeLogError):
-    """The name belongs to a finished episode, or to one being written."""
+    """The name belongs to an existing episode: finished, being written or cut off."""
 
 
 class EpisodeInUseError(EpisodeLogError):
@@ -48,7 +48,7 @@ class EpisodeInUseError(EpisodeLogError):
 
 
 class EpisodeReadError(ValueError):
-    """A file is no complete, undamaged episode; the message is one line with path and reason."""
+    """A file is not a valid episode; the message is one line with path and reason."""
 
     def __init__(self, message: str) -> None:
         super().__init__(_line(message))
@@ -64,39 +64,39 @@ _LISTED = 3
 
 
 def active_path(directory: Path, name: str) -> Path:
-    """Return the directory in which the episode `name` is written."""
+    """Return the hidden directory in which the episode `name` is written."""
     return directory / f'{_PREFIX}{name}{_SUFFIX}'
 
 
 def aside_path(directory: Path, name: str) -> Path:
-    """Return the directory to which recovery moves the episode `name` if it has no messages."""
+    """Return the hidden directory for files of the episode `name` that recovery cannot use."""
     return directory / f'{_PREFIX}{name}{_ASIDE}'
 
 
 def active_name(path: Path) -> str | None:
-    """Return the name of the episode that is written in `path`, None for other directories."""
+    """Return the name of the episode whose hidden directory is `path`; None for other paths."""
     if path.name.startswith(_PREFIX) and path.name.endswith(_SUFFIX):
         return path.name[len(_PREFIX) : -len(_SUFFIX)]
     return None
 
 
 def bag_file(directory: Path, name: str) -> Path:
-    """Return the MCAP file of the episode `name` in its directory, hidden or not."""
+    """Return the MCAP file of the episode `name` inside its own directory `directory`."""
     return directory / f'{name}_0.mcap'
 
 
 def rewritten_file(file: Path) -> Path:
-    """Return the file that recovery writes before it replaces `file`."""
+    """Return the temporary file that recovery writes and then renames to `file`."""
     return file.with_suffix('.recovered')
 
 
 def metadata_file(directory: Path) -> Path:
-    """Return rosbag2's description of the bag in a directory."""
+    """Return the path of rosbag2's `metadata.yaml` in a bag directory."""
     return directory / 'metadata.yaml'
 
 
 def is_mcap(path: Path) -> bool:
-    """Return whether a path has the name of an MCAP file; `._` files of macOS do not count."""
+    """Return whether a path ends in `.mcap` and is not a `._` file of macOS."""
     return path.suffix == '.mcap' and not path.name.startswith('._')
 
 
@@ -104,9 +104,9 @@ def is_mcap(path: Path) -> bool:
 
 
 def find_episodes(directory: Path | str) -> list[Path]:
-    """Return bag directories and MCAP files in a directory, by name, without opening them.
+    """Return the bag directories and MCAP files in a directory, sorted by name, unopened.
 
-    Hidden directories contain unfinished episodes (`find_leftovers`) and are left out. An
+    Directories `.<name>.active` and `.<name>.aside` are left out; see `find_leftovers`. An
     unreadable directory raises EpisodeReadError.
     """
     try:
@@ -128,7 +128,7 @@ def _is_bag(path: Path) -> bool:
 
 
 def folders_below(directory: Path) -> str:
-    """List, for an error, the first subfolders of a directory that contain episodes."""
+    """Return the names of the first subfolders that contain episodes, as text for an error."""
     try:
         folders = [path for path in sorted(directory.iterdir()) if path.is_dir()]
         held = [path for path in folders if path.name[0] != '.' and find_episodes(path)]
@@ -138,7 +138,7 @@ def folders_below(directory: Path) -> str:
 
 
 def holds_no_episode(directory: Path) -> EpisodeReadError:
-    """Return the error for a folder without episodes; it names folders below that have some."""
+    """Return the error for a folder without episodes; it names subfolders that contain some."""
     below = folders_below(directory)
     return EpisodeReadError(
         f'{directory} holds no episode{f"; there are some in {below}" if below else ""}'
@@ -146,7 +146,10 @@ def holds_no_episode(directory: Path) -> EpisodeReadError:
 
 
 def expand_episodes(path: Path | str) -> list[Path]:
-    """Return the path itself, or the episodes in a directory, or raise EpisodeReadError."""
+    """Return the episodes in a directory, or only `path` if it is a bag or a file.
+
+    A missing or unreadable path raises EpisodeReadError.
+    """
     path = Path(path)
     try:
         if not path.exists():
@@ -163,7 +166,7 @@ def read_each(
     read: Callable[[Path], Read],
     on_skip: Callable[[EpisodeReadError], object] | None = None,
 ) -> Iterator[Read]:
-    """Yield the result of `read` for each path; `on_skip` takes the errors, otherwise raised."""
+    """Yield `read(path)` for each path; pass each error to `on_skip`, or raise it for None."""
     for path in paths:
         try:
             result = read(path)
@@ -176,7 +179,10 @@ def read_each(
 
 
 def mcap_file(path: Path) -> Path:
-    """Return the MCAP file of a bag directory, or the path itself, or raise EpisodeReadError."""
+    """Return the MCAP file in a bag directory; a path to a file is returned unchanged.
+
+    A directory without exactly one MCAP file raises EpisodeReadError.
+    """
     try:
         if not path.is_dir():
             if path.exists() and not path.is_file():
@@ -200,8 +206,8 @@ def claim(directory: Path, name: str) -> BufferedWriter:
     """Create the hidden directory of an episode and its locked, empty MCAP file.
 
     Raises:
-        EpisodeExistsError: If an episode of this name is finished, being written or cut off. Of
-            several processes, one succeeds.
+        EpisodeExistsError: If an episode of this name is finished, being written or cut off. If
+            several processes try at the same time, one succeeds.
     """
     active = active_path(directory, name)
     try:
@@ -228,7 +234,7 @@ def claim(directory: Path, name: str) -> BufferedWriter:
 
 
 def require_free_space(directory: Path, minimum_bytes: int) -> None:
-    """Raise `OSError` if less than `minimum_bytes` can be written to the disk of `directory`."""
+    """Raise `OSError` if the disk of `directory` has less than `minimum_bytes` free."""
     status = os.statvfs(directory)
     free = status.f_bavail * status.f_frsize
     if free < minimum_bytes:
@@ -239,7 +245,7 @@ def require_free_space(directory: Path, minimum_bytes: int) -> None:
 
 
 def lock(stream: IO[bytes]) -> None:
-    """Lock a file as being written, until this process closes it or ends."""
+    """Lock a file to mark that this process writes it; closing the file releases the lock."""
     # File systems without locks only lose the distinction between running and cut-off episodes.
     with suppress(OSError):
         fcntl.flock(stream, fcntl.LOCK_EX)
@@ -257,7 +263,7 @@ def try_lock(stream: IO[bytes], shared: bool = False) -> bool:
 
 
 def open_regular(path: Path) -> BinaryIO:
-    """Open a regular file for reading without following links; raise OSError for others."""
+    """Open a regular file for reading; raise OSError for links, pipes and other kinds."""
     if not stat.S_ISREG(path.lstat().st_mode):
         raise OSError(errno.EINVAL, 'is no regular file', str(path))
     flags = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
@@ -265,13 +271,13 @@ def open_regular(path: Path) -> BinaryIO:
 
 
 def create(path: Path) -> BinaryIO:
-    """Open a new file for writing; an existing file or link of the name is removed."""
+    """Create a file for writing; remove an existing file or link of this name first."""
     path.unlink(missing_ok=True)
     return path.open('xb')
 
 
 def is_locked(path: Path) -> bool:
-    """Return whether a process is writing the regular file."""
+    """Return whether a process holds the write lock of a regular file."""
     with open_regular(path) as stream:
         return not try_lock(stream, shared=True)
 
@@ -286,7 +292,7 @@ def sync_directory(path: Path) -> None:
 
 
 def store(stream: IO[bytes], directory: Path, description: str) -> None:
-    """Write `metadata.yaml` and flush it and the finished MCAP file to the disk (fsync)."""
+    """Write `description` as `metadata.yaml`; flush it and the MCAP file to disk (fsync)."""
     stream.flush()
     os.fsync(stream.fileno())
     with create(metadata_file(directory)) as text:
@@ -296,7 +302,7 @@ def store(stream: IO[bytes], directory: Path, description: str) -> None:
 
 
 def publish(active: Path, final: Path) -> None:
-    """Rename the hidden directory of a complete episode to its name, atomically."""
+    """Rename the hidden directory `active` of a complete episode to `final`, atomically."""
     sync_directory(active)
     active.rename(final)
     sync_directory(final.parent)

@@ -1,8 +1,7 @@
-"""Parse whole MCAP files, and refuse those whose indexes and contents disagree.
+"""Parse whole MCAP files, and reject files whose indexes and contents disagree.
 
-Some readers of MCAP read a file from the beginning. Others start at the summary and follow its
-indexes. A file is ambiguous if these ways lead to different contents; `parse_file` raises
-`ValueError` then.
+Some programs read an MCAP file from the beginning. Others start at the summary and follow its
+indexes. A file is ambiguous if both ways lead to different contents; `parse_file` rejects it.
 """
 
 from __future__ import annotations
@@ -53,7 +52,7 @@ Summary = dict[int, list[tuple[int, int]]]
 
 
 def parse_file(data: bytes) -> tuple[Contents, Messages]:
-    """Parse a whole file; ValueError if it is damaged, beyond the limits, or ambiguous."""
+    """Parse a whole file; ValueError if it is damaged, ambiguous, or larger than the limits."""
     if not data.endswith(MCAP0_MAGIC):
         raise ValueError('truncated, damaged or no MCAP file: its last bytes are not those of one')
     contents = Contents()
@@ -85,7 +84,7 @@ def parse_file(data: bytes) -> tuple[Contents, Messages]:
 
 
 def require_one_meaning(contents: Contents) -> None:
-    """Raise ValueError for several episodes in a file, and for ambiguous names."""
+    """Raise ValueError if a file has two episodes, or two topics or attachments of one name."""
     for name, count in Counter(each.name for each in contents.metadata).items():
         if count > 1 and name.startswith('episode'):
             raise ValueError(
@@ -111,7 +110,7 @@ def _fields(data: bytes, position: int, end: int) -> Fields:
 
 
 def _numbers(data: bytes, position: int, end: int, layout: struct.Struct) -> tuple[int, ...]:
-    """Return the fields of a record that contains only numbers."""
+    """Return the fields of the record `data[position:end]`, which contains only numbers."""
     fields = _fields(data, position, end)
     numbers = fields.numbers(layout)
     fields.end()
@@ -125,7 +124,7 @@ def _check_data_crc(data: bytes, position: int, end: int) -> None:
 
 
 def _check_footer(data: bytes, summary: Summary, summary_start: int) -> None:
-    """Check that the footer points at the summary that follows the data."""
+    """Check that the file ends with one footer, which points at the summary and has its CRC."""
     footers = summary[Opcode.FOOTER]
     if len(footers) != 1 or footers[0][1] != len(data) - len(MCAP0_MAGIC):
         raise ValueError('truncated or damaged: the file does not end with one footer')
@@ -153,7 +152,7 @@ def _check_offsets(data: bytes, summary: Summary) -> None:
 
 
 def _check_record_indexes(data: bytes, summary: Summary, contents: Contents) -> None:
-    """Check that the indexes of metadata and attachments contain all records, or none."""
+    """Check that the index of metadata, and that of attachments, is missing or complete."""
     for what, opcode, expected in (
         ('metadata', Opcode.METADATA_INDEX, [each.index for each in contents.metadata]),
         ('attachments', Opcode.ATTACHMENT_INDEX, [each.index for each in contents.attachments]),
@@ -166,7 +165,7 @@ def _check_record_indexes(data: bytes, summary: Summary, contents: Contents) -> 
 def _check_chunk_indexes(
     data: bytes, summary: Summary, contents: Contents, messages: Messages
 ) -> None:
-    """Check that the chunk indexes list no chunk or all, with their true places and sizes."""
+    """Check that the chunk indexes are missing, or list each chunk with its position and size."""
     _check_chunk_times(contents, messages)
     if not summary[Opcode.CHUNK_INDEX]:
         return
@@ -202,7 +201,7 @@ def _check_chunk_indexes(
 
 
 def _check_chunk_times(contents: Contents, messages: Messages) -> None:
-    """Check the first and last log time of each chunk; readers skip chunks by them."""
+    """Check the first and last log time that each chunk records; readers skip chunks by them."""
     order = np.argsort(messages.starts)
     starts, times = messages.starts[order], messages.headers['log_time'][order]
     for chunk in contents.chunks:
@@ -214,7 +213,7 @@ def _check_chunk_times(contents: Contents, messages: Messages) -> None:
 
 
 def _check_message_indexes(contents: Contents, messages: Messages) -> None:
-    """Check that the message indexes contain all messages, or none."""
+    """Check that the message indexes are missing, or list all messages."""
     if not contents.message_indexes:
         return
     found = contents.message_indexes
@@ -237,7 +236,7 @@ def _check_message_indexes(contents: Contents, messages: Messages) -> None:
 def _check_statistics(
     data: bytes, summary: Summary, contents: Contents, messages: Messages
 ) -> None:
-    """Check the statistics. Some tools write 0 for all counts except that of the messages."""
+    """Check the recorded counts and times; 0 is allowed for counts other than of messages."""
     if len(summary[Opcode.STATISTICS]) > 1:
         raise ValueError('ambiguous: two records of statistics')
     for position, end in summary[Opcode.STATISTICS]:

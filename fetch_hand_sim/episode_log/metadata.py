@@ -1,7 +1,6 @@
-"""The two metadata records of an episode, `episode` and `episode_result`: written and parsed.
+"""Write and parse the two metadata records of an episode, `episode` and `episode_result`.
 
-The text of a file may come from anyone: a number is parsed within its bounds, a word must be one of
-those allowed.
+Files may come from unknown sources. Numbers must be within bounds, and names must be allowed ones.
 """
 
 from __future__ import annotations
@@ -49,12 +48,13 @@ class EpisodeRecord:
     """Contents of the metadata record `episode`.
 
     Attributes:
-        task: The task, with the joint names of its messages, `episode_ticks` at 25 Hz.
+        task: The task at 25 Hz, with the joint names of the messages; see also `spec`.
         episode: Number of the episode in its run, from 0.
         control_hz: Ticks per simulated second.
-        interface_version: Meaning of the messages, see `msgs_spec.topics.INTERFACE_VERSION`.
+        interface_version: Version of the messages, see `msgs_spec.topics.INTERFACE_VERSION`.
         perturb_limit: Largest force of a push, N; 0 if pushes were off.
-        timing: Quantities kept at rates other than 25 Hz, see `msgs_spec.tasks.Timing`.
+        timing: What stays the same at rates other than 25 Hz: duration and gripper speed
+            (`seconds`), or number of ticks and gripper motion per tick (`ticks`).
     """
 
     task: TaskSpec
@@ -100,9 +100,10 @@ class EpisodeOutcome:
     """Contents of the metadata record `episode_result`; None for missing values.
 
     Attributes:
-        received_not_logged: Number of received messages beyond the allowance, by topic.
-        late_commands: Steps whose command did not answer the observation before; None in lockstep,
-            in generated episodes and in files of version 1.
+        received_not_logged: Number of received messages that were not logged, because their topic
+            had too many, by topic.
+        late_commands: Steps whose command was not computed from the observation right before; None
+            in lockstep, in generated episodes and in files of interface version 1.
     """
 
     is_complete: bool = True
@@ -115,7 +116,7 @@ class EpisodeOutcome:
 
     @classmethod
     def parse(cls, result: Strings) -> EpisodeOutcome:
-        """Parse the contents of the record."""
+        """Parse the contents of the record; missing and invalid numbers become None."""
         is_complete = _flag(result.get('complete', '')) is True
         return cls(
             is_complete=is_complete,
@@ -128,7 +129,7 @@ class EpisodeOutcome:
         )
 
     def to_strings(self) -> dict[str, str]:
-        """Return the contents of the record."""
+        """Return the contents of the record, without missing values."""
         known = {
             'steps': None if self.steps is None else str(self.steps),
             'return': None if self.episode_return is None else repr(self.episode_return),
@@ -144,7 +145,7 @@ class EpisodeOutcome:
 
 
 class HasOutcome:
-    """Base of classes that hold the record `episode_result` of an episode."""
+    """Base of classes with the attribute `result`, the record `episode_result` as strings."""
 
     __slots__ = ()
 
@@ -152,7 +153,7 @@ class HasOutcome:
 
     @property
     def outcome(self) -> EpisodeOutcome:
-        """How the episode ended."""
+        """The parsed record `episode_result`: how the episode ended."""
         return EpisodeOutcome.parse(self.result)
 
     @property
@@ -224,7 +225,7 @@ def _flag(text: str) -> bool | None:
 
 
 def _number_or_none(text: str, kind: type[Number]) -> Number | None:
-    """Return a finite number within int64; None for all other text."""
+    """Parse a finite number within the range of int64; None for other text."""
     try:
         value = kind(text)
     except ValueError:
@@ -268,13 +269,13 @@ def episode_metadata(
 
     Args:
         episode: Number of the episode in this run, from 0; file names count over all runs.
-        timing: Quantities kept at other rates, recorded only if it is `seconds` and the rate is
-            not 25 Hz. Files without it mean `ticks`, as those of version 1.0.
-        joint_prefix: Recorded only if it is not the usual one.
-        model_sha256: Fingerprint of the compiled model, see `model_sha256`.
+        timing: See `EpisodeRecord`. Recorded only if it is `seconds` and the rate is not 25 Hz;
+            files without it, such as those of version 1.0, are read as `ticks`.
+        joint_prefix: Recorded only if it is not the default.
+        model_sha256: Hash of the compiled model, see `recorder.model_sha256`.
         perturb_limit: Largest force of a push, N; recorded only if pushes are on.
         disturbances: Disturbances of the robot, JSON, or ''.
-        variation: Values that the episode drew from them, JSON, or ''.
+        variation: Values drawn from the disturbances for this episode, JSON, or ''.
         started: Wall-clock time of the start, ISO 8601. Without it, equal runs give equal files.
     """
     in_seconds = timing == 'seconds' and control_hz != DEFAULT_CONTROL_HZ

@@ -42,7 +42,7 @@ _LONGEST_SCHEMA = 8000
 
 @dataclass(frozen=True, slots=True)
 class LoggedMessage:
-    """One message; `sequence` counts the messages of a topic from 0, `data` are CDR bytes."""
+    """A message of an episode; `sequence` is its number in its topic, `data` are CDR bytes."""
 
     log_time_ns: int
     publish_time_ns: int
@@ -52,7 +52,10 @@ class LoggedMessage:
 
 @dataclass(frozen=True, slots=True)
 class LoggedTopic:
-    """A topic of an episode with its messages by log time; `qos_yaml` is rosbag2 YAML."""
+    """A topic of an episode with its messages, sorted by log time.
+
+    `qos_yaml` is the QoS profile of the publisher, in the format of rosbag2.
+    """
 
     type_name: str
     qos_yaml: str
@@ -78,7 +81,7 @@ class EpisodeSummary(HasOutcome):
 
 @dataclass(frozen=True, eq=False)
 class Episode(EpisodeSummary):
-    """A checked episode file: attachments by file name, schemas and channels by id."""
+    """A valid episode with its messages; attachments by file name, schemas and channels by id."""
 
     attachments: dict[str, bytes]
     schemas: dict[int, Schema]
@@ -87,7 +90,7 @@ class Episode(EpisodeSummary):
 
     @cached_property
     def topics(self) -> dict[str, LoggedTopic]:
-        """Topics by resolved name, in order of the first message."""
+        """Topics by full name, in the order of their first messages."""
         found: dict[int, LoggedTopic] = {}
         for id, sequence, log_time, publish_time, data in self.sorted_messages.rows():
             if id not in found:
@@ -102,14 +105,13 @@ class Episode(EpisodeSummary):
         return {self.channels[id].topic: logged for id, logged in found.items()}
 
     def count(self, name: str) -> int:
-        """Return the number of messages of a topic; its namespace does not matter."""
+        """Return the number of messages of a topic, named without its namespace."""
         return len(self._indices(name))
 
     def rows(self, name: str) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
-        """Return log times (n,), ns, and CDR bytes (n, size) of the messages of a topic.
+        """Return the log times (n,), ns, and the CDR bytes (n, size) of all messages of a topic.
 
-        Raises:
-            ValueError: Unless there are messages, all of one size.
+        A topic without messages, or with messages of different sizes, raises ValueError.
         """
         indices, messages = self._indices(name), self.sorted_messages
         starts, headers = messages.starts[indices], messages.headers[indices]
@@ -130,11 +132,11 @@ class Episode(EpisodeSummary):
 
 
 def read_episode(path: Path | str) -> Episode:
-    """Read an episode, a bag directory or its MCAP file, with all checks.
+    """Read and check an episode; `path` is a bag directory or an MCAP file.
 
     Raises:
-        EpisodeReadError: If the file is missing, damaged, ambiguous or no episode, or its topics
-            are not those of its task.
+        EpisodeReadError: If the file is missing, damaged, ambiguous or not an episode, or has a
+            topic that its task does not have.
     """
     file = files.mcap_file(Path(path))
     with one_line_errors(file):
@@ -169,7 +171,7 @@ def read_episode(path: Path | str) -> Episode:
 
 @contextmanager
 def one_line_errors(file: Path) -> Iterator[None]:
-    """Turn the errors of a file into `EpisodeReadError`, in one line that names the file."""
+    """Convert errors in the block to `EpisodeReadError`, with one line that names the file."""
     try:
         yield
     except OSError as error:
@@ -198,10 +200,9 @@ def _why_unfinished(file: Path) -> str:
 
 
 def require_contract(metadata: dict[str, str], contents: Contents) -> None:
-    """Raise ValueError unless names, types and definitions of the topics are those of the task.
+    """Raise ValueError if a topic of a file does not have a name, type and definition of the task.
 
-    All topics must have the same namespace. Topics of an unknown task are not compared, because
-    nothing can decode them.
+    All topics must have the same namespace. A file with an unknown task is not checked.
     """
     try:
         task = parse_task(metadata)
@@ -235,14 +236,14 @@ def require_contract(metadata: dict[str, str], contents: Contents) -> None:
 
 @lru_cache(maxsize=256)
 def contract_topics(task: TaskSpec) -> dict[str, TopicSpec]:
-    """Return the topics of a task by name without leading slash."""
+    """Return all topics that an episode of a task may contain, by name without leading slash."""
     specs = (*topics(task), *ground_truth_topics(task))
     return {spec.name.lstrip('/'): spec for spec in specs}
 
 
 @lru_cache(maxsize=256)
 def _defines(type_name: str, text: bytes) -> bool:
-    """Return whether a `ros2msg` text has the fields that ROS 2 Jazzy gives the type."""
+    """Return whether a message definition (`ros2msg`) has the fields of the type in ROS 2 Jazzy."""
     expected = schema_text(type_name)
     if text == expected.encode():
         return True
@@ -261,7 +262,7 @@ def _defines(type_name: str, text: bytes) -> bool:
 
 
 def read_summary(path: Path | str) -> EpisodeSummary:
-    """Read metadata and result of an episode, with all checks of `read_episode`."""
+    """Read and check an episode like `read_episode`; return it without its messages."""
     episode = read_episode(path)
     return EpisodeSummary(
         **{each.name: getattr(episode, each.name) for each in fields(EpisodeSummary)}
@@ -273,7 +274,7 @@ def read_summary(path: Path | str) -> EpisodeSummary:
 
 @dataclass(frozen=True, slots=True)
 class TickMessage:
-    """A message of a tick; the topic name is relative to the namespace of the robot."""
+    """A message of a tick; the name in `topic` has no namespace."""
 
     topic: TopicSpec
     log_time_ns: int
@@ -282,19 +283,22 @@ class TickMessage:
 
 @dataclass(frozen=True, slots=True)
 class LoggedTick:
-    """The messages from one stamp to the next, in order."""
+    """All messages of one tick, in order: published by the robot, then received by it."""
 
     stamp_ns: int
     published: list[TickMessage] = field(default_factory=list)
     received: list[TickMessage] = field(default_factory=list)
 
     def find(self, name: str) -> TickMessage | None:
-        """Return the published message of a topic, or None."""
+        """Return the message that the robot published on a topic, None without one."""
         return next((m for m in self.published if m.topic.name == name), None)
 
 
 def logged_topics(episode: Episode) -> dict[str, TopicSpec]:
-    """Return the topics of an episode by resolved name, or raise EpisodeReadError."""
+    """Return the specification of each topic in an episode, by full topic name.
+
+    An episode without messages, or of an unknown task, raises EpisodeReadError.
+    """
     with one_line_errors(episode.path):
         known = contract_topics(parse_task(episode.metadata))
         if not episode.topics:
@@ -303,10 +307,10 @@ def logged_topics(episode: Episode) -> dict[str, TopicSpec]:
 
 
 def split_ticks(episode: Episode) -> list[LoggedTick]:
-    """Divide an episode into its ticks. The first message of a tick is `/clock`.
+    """Divide an episode into its ticks; each `/clock` message begins a tick.
 
     Raises:
-        EpisodeReadError: If the messages are not in this order.
+        EpisodeReadError: If the first message is not of `/clock`, or the task is unknown.
     """
     specs = logged_topics(episode)
     messages = (

@@ -1,7 +1,7 @@
-"""Parse the data section of MCAP files within bounds of memory and CPU time.
+"""Parse the data section of MCAP files with limited memory and CPU time.
 
-`Contents` takes the records one after the other, so recovery can keep what comes before a damage.
-`parse_file` takes whole files and checks them with `summary`.
+`Contents` parses one record at a time, so recovery can keep all records before a damaged one. For
+whole files, `indexes.parse_file` also checks the summary.
 """
 
 from __future__ import annotations
@@ -78,9 +78,9 @@ _LATEST_NS = 2**63 - 1
 
 
 class Fields:
-    """Cursor over the fields of one record.
+    """Reads the fields of one record, one after the other.
 
-    Methods raise `ValueError` if the record is too short, and for text that is not UTF-8.
+    Methods raise `ValueError` if the record is too short, or if text is not UTF-8.
     """
 
     def __init__(self, data: bytes, kind: str) -> None:
@@ -94,7 +94,7 @@ class Fields:
         return self._position == len(self._data)
 
     def end(self) -> None:
-        """Reject bytes after the last field: some readers skip them, others parse them."""
+        """Raise ValueError for bytes after the last field, which some programs would parse."""
         if not self.is_at_end:
             raise ValueError(f'ambiguous: a {self._kind} record is longer than its fields')
 
@@ -103,7 +103,7 @@ class Fields:
         return int.from_bytes(self.bytes(size), 'little')
 
     def numbers(self, layout: struct.Struct) -> tuple[int, ...]:
-        """Read several numbers at once."""
+        """Read several numbers of the binary format `layout`."""
         return layout.unpack(self.bytes(layout.size))
 
     def bytes(self, size: int) -> bytes:
@@ -136,13 +136,13 @@ class Fields:
 
 
 def shown(text: str) -> str:
-    """Return a text from a file in quotes, shortened so that it fits into a line."""
+    """Quote a text from a file for an error message, shortened to one line."""
     return f"'{one_line(text, longest=60)}'"
 
 
 @dataclass(frozen=True, slots=True)
 class Schema:
-    """A type of messages."""
+    """A schema record of MCAP: name and definition of a message type."""
 
     name: str
     encoding: str
@@ -151,7 +151,7 @@ class Schema:
 
 @dataclass(frozen=True, slots=True)
 class Channel:
-    """A topic."""
+    """A channel record of MCAP: a topic and its encoding."""
 
     schema_id: int
     topic: str
@@ -161,7 +161,14 @@ class Channel:
 
 @dataclass(frozen=True, slots=True)
 class Chunk:
-    """Place and header of a chunk, and the place of its records in `Messages.unpacked`."""
+    """Position and header of a chunk in the file.
+
+    Attributes:
+        position: Byte offset of the chunk record in the file.
+        length: Bytes of the chunk record.
+        times: First and last log time of its messages, ns, as the chunk records them.
+        base: Byte offset of its unpacked records in `Messages.unpacked`.
+    """
 
     position: int
     length: int
@@ -173,7 +180,7 @@ class Chunk:
 
 
 class MessageIndex(NamedTuple):
-    """A message index, where it is, and the number of its chunk."""
+    """A message index record; `chunk` is the number of its chunk, `position` its byte offset."""
 
     chunk: int
     position: int
@@ -183,7 +190,7 @@ class MessageIndex(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class MetadataRecord:
-    """A metadata record; `index` is the body of the index record that lists it."""
+    """A metadata record; `index` is the content that its index record must have."""
 
     index: bytes
     name: str
@@ -192,7 +199,7 @@ class MetadataRecord:
 
 @dataclass(frozen=True, slots=True)
 class AttachmentRecord:
-    """An attachment; `index` is the body of the index record that lists it."""
+    """An attachment; `index` is the content that its index record must have."""
 
     index: bytes
     name: str
@@ -201,11 +208,11 @@ class AttachmentRecord:
 
 
 class Contents:
-    """The records of the data section of a file, in or outside of chunks.
+    """All records of the data section of a file, inside and outside of chunks.
 
-    `take` raises `ValueError` at damage, beyond the limits, and if an id is defined twice with
-    different contents; then it leaves out the record. Schemas and channels are stored by id, other
-    records in order.
+    `take` raises `ValueError` and skips the record in three cases: it is damaged, it exceeds a
+    limit, or it defines an existing id with different contents. Schemas and channels are stored by
+    id, other records in order.
     """
 
     def __init__(self) -> None:
@@ -224,7 +231,7 @@ class Contents:
         self._channel_starts: dict[int, int] = {}
 
     def take(self, opcode: int, data: bytes, position: int, end: int) -> None:
-        """Parse and keep the record `data[position:end]`."""
+        """Parse and store the record `data[position:end]`."""
         start = position + RECORD.size
         if opcode == _MESSAGE_INDEX:
             self._take_message_index(data[start:end], position)
@@ -244,7 +251,7 @@ class Contents:
             self._take_attachment(data[start:end], position, end - position)
 
     def define(self, opcode: int, content: bytes, offset: int = 0) -> None:
-        """Parse and keep a schema or channel; it may repeat an earlier one."""
+        """Parse and store a schema or channel record `offset` bytes into its chunk."""
         id = int.from_bytes(content[:2], 'little')
         known = self._definitions.get((opcode, id))
         if known == content:
@@ -275,11 +282,14 @@ class Contents:
 
     @property
     def message_count(self) -> int:
-        """Number of messages so far."""
+        """Number of messages stored so far."""
         return len(self._starts)
 
     def messages(self) -> Messages:
-        """Return all messages by log time; ValueError for equal times or undefined channels."""
+        """Return all messages, sorted by log time.
+
+        Equal times, times beyond int64, and messages before their channel raise ValueError.
+        """
         unpacked = b''.join(self._runs)
         starts = np.array(self._starts, dtype=np.int64)
         buffer = np.frombuffer(unpacked, np.uint8)
@@ -329,7 +339,7 @@ class Contents:
         )
 
     def _take_run(self, data: bytes) -> None:
-        """Parse and keep a sequence of records: schemas, channels and messages."""
+        """Parse and store consecutive records: schemas, channels and messages."""
         starts: list[int] = []
         position, end, base = 0, len(data), self._size
         read = RECORD.unpack_from
@@ -389,7 +399,7 @@ class Contents:
 
 
 def _text(text: str) -> bytes:
-    """Encode a text as MCAP does: its length, then UTF-8."""
+    """Encode a text for MCAP: its length in bytes (4 bytes), then UTF-8."""
     return len(text.encode()).to_bytes(4, 'little') + text.encode()
 
 
@@ -398,9 +408,9 @@ class Messages:
     """The messages of a file, sorted by log time.
 
     Attributes:
-        unpacked: Contents of all chunks, and records outside of chunks, one after the other.
-        starts: (n,) start of each message record in `unpacked`.
-        headers: (n,) of type `MESSAGE`.
+        unpacked: All unpacked chunks and all records outside of chunks, one after the other.
+        starts: (n,) byte offset of each message record in `unpacked`.
+        headers: (n,) headers of the messages, of the structured type `MESSAGE`.
     """
 
     unpacked: bytes
@@ -416,10 +426,10 @@ class Messages:
 
 
 def split_records(data: bytes) -> Iterator[tuple[int, int, int]]:
-    """Yield opcode, position and end of each record of a file, from its header on.
+    """Yield opcode, start and end (byte offsets) of each record of a file, from its header on.
 
-    The caller stops at the footer, because the magic at the end is no record. A file that ends
-    within a record, or has more than `MAX_RECORDS` records, raises ValueError.
+    `data` may end with the magic bytes, which are no record; then stop at the footer. A file that
+    ends within a record, or has more than `MAX_RECORDS` records, raises ValueError.
     """
     magic = len(MCAP0_MAGIC)
     if data[:magic] != MCAP0_MAGIC:
@@ -441,7 +451,7 @@ def split_records(data: bytes) -> Iterator[tuple[int, int, int]]:
 
 
 def _unpack(packed: bytes, compression: str, size: int) -> bytes:
-    """Return the contents of a chunk, which must have `size` bytes."""
+    """Decompress a chunk; ValueError unless the result has `size` bytes."""
     try:
         data = _decompress(packed, compression, size)
     except (zstandard.ZstdError, RuntimeError, EOFError) as error:

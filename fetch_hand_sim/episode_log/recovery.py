@@ -1,7 +1,7 @@
 """Find episodes that a killed process or a full disk cut off, and make valid bags of them.
 
-Every folder may contain anything. An entry with the name of a leftover and other
-contents is reported with its problem; it is never followed, waited for or entered.
+The hidden directory of a cut-off episode is a leftover. An entry that has such a name, but was not
+written by this package, is only reported. Links are not followed, and other files are not opened.
 """
 
 from __future__ import annotations
@@ -48,11 +48,14 @@ _COUNTED = ('reward', 'is_success', 'applied_command')
 
 @dataclass(frozen=True, slots=True)
 class Leftover:
-    """An episode that was not completed.
+    """An unfinished episode that no process is writing.
 
     Attributes:
+        name: Name of the episode.
+        path: Its hidden directory.
         age_s: Seconds since the last write.
-        problem: Reason why no robot can have left it, or ''.
+        problem: Why the directory is not the rest of an episode, or cannot be read; '' if it can
+            be recovered.
     """
 
     name: str
@@ -71,9 +74,10 @@ class Leftover:
 
 
 def find_leftovers(directory: Path | str) -> list[Leftover]:
-    """Return the unfinished episodes in a directory by name, without those in progress.
+    """Return the unfinished episodes in a directory, sorted by name.
 
-    The directory may be missing. EpisodeLogError if it is unreadable.
+    Episodes that a process is writing are left out. The result is empty for a missing directory; an
+    unreadable one raises EpisodeLogError.
     """
     try:
         found = [_inspect(path) for path in sorted(Path(directory).iterdir())]
@@ -87,7 +91,7 @@ def find_leftovers(directory: Path | str) -> list[Leftover]:
 
 
 def _inspect(path: Path) -> Leftover | None:
-    """Describe a hidden directory; None if a process still writes it or it is gone."""
+    """Describe a leftover; return None for other paths and while a process is writing it."""
     name = files.active_name(path)
     if name is None:
         return None
@@ -107,7 +111,7 @@ def _inspect(path: Path) -> Leftover | None:
 
 
 def _entries(path: Path, name: str) -> list[Path]:
-    """Return the files of a hidden directory; OSError if one was not written by this package."""
+    """Return the files in a leftover; OSError for a file that this package does not write."""
     if not stat.S_ISDIR(path.lstat().st_mode):
         raise NotADirectoryError(errno.ENOTDIR, 'is no directory', str(path))
     file = files.bag_file(path, name)
@@ -122,19 +126,19 @@ def _entries(path: Path, name: str) -> list[Path]:
 
 
 def recover_episode(leftover: Path | str) -> Path | None:
-    """Complete an episode that a crash cut off; return its bag, or None without messages.
+    """Make a valid bag of an unfinished episode; return its directory, or None without messages.
 
-    All whole chunks become a bag under the name of the episode; at most the last quarter of a
-    second is missing. The new file replaces the torn one when it has been read back. If more than a
-    few bytes of the torn file are unreadable, it is kept in `.<name>.aside`.
+    The bag contains all complete chunks; at most the last quarter of a second is missing. The new
+    file is read back before it replaces the cut-off file. If more than a few bytes of the cut-off
+    file are unreadable, a copy of it is kept in `.<name>.aside`.
 
-    An episode without readable messages is moved to `.<name>.aside`. It is removed if its file is
-    empty, or has only a few bytes beyond a good header.
+    An episode without readable messages is moved to `.<name>.aside`. If its file contains at most a
+    few bytes after the header, it is removed instead.
 
     Raises:
-        EpisodeInUseError: If another process writes, recovers or has recovered it.
-        EpisodeLogError: If it is damaged, ambiguous or no leftover of a robot, or the disk fails.
-            The leftover stays as it is.
+        EpisodeInUseError: If another process writes, recovers or has recovered the episode.
+        EpisodeLogError: If the episode is ambiguous or not written by this package, or the disk
+            fails. The episode stays unfinished then.
     """
     leftover = Path(leftover)
     name = files.active_name(leftover)
@@ -211,11 +215,11 @@ class _Remains:
     """The readable part of a cut-off file.
 
     Attributes:
-        contents: Records up to the first damage.
+        contents: Records before the first damaged one.
         is_whole: Whether the file has a footer.
-        is_empty: Whether the file has only a few bytes beyond a good header.
-        damage: Reason why reading stopped; '' at the end of the file.
-        unread_bytes: Bytes from there to the end of the file.
+        is_empty: Whether the file contains at most a few bytes after the header.
+        damage: Description of the damage at which reading stopped; '' without damage.
+        unread_bytes: Bytes from the damage to the end of the file.
     """
 
     contents: Contents
@@ -252,7 +256,10 @@ def _read(stream: BinaryIO) -> _Remains:
 
 @contextmanager
 def _replaced(file: Path, remains: _Remains, aside: Path) -> Iterator[None]:
-    """Replace a cut-off file by a valid one; it stays locked until the block ends."""
+    """Replace a cut-off file by a valid one, which stays locked until the block ends.
+
+    The cut-off file is copied to `aside` if more than a few bytes of it are unreadable.
+    """
     contents = remains.contents
     records = {record.name: record.content for record in contents.metadata}
     if EPISODE not in records:
@@ -303,7 +310,7 @@ def _write(
 
 
 def _outcome(values: dict[str, list[bytes]], specs: dict[str, TopicSpec]) -> EpisodeOutcome:
-    """Return steps, return and success up to the last whole tick."""
+    """Compute steps, return and success from the messages up to the last whole tick."""
     cut_off = EpisodeOutcome(is_complete=False, reason=RECOVERED)
     rewards, successes, commands = values.values()
     # `applied_command` comes last among the topics with a message per tick.

@@ -1,10 +1,9 @@
-"""Write episodes: their messages, metadata, and how they ended.
+"""Write episode files: messages, metadata and result.
 
-Log times are simulated time plus one nanosecond for each message of a tick. All messages of a tick
-have the same stamp, and a file needs an order. Message number r after the stamp s, counted from 0,
-is logged at s + r nanoseconds. The messages of the tick come first, in their order. Messages
-received before the next tick follow, in the order they arrive. So a command lies between the state
-it was computed from and the state it leads to, and times grow strictly.
+All messages of a tick have the same stamp, but log times must grow. So message number r of a tick,
+counted from 0, has the log time stamp + r nanoseconds. Messages that the robot publishes come
+first. Messages that it receives before the next tick follow, in the order they arrive. So a command
+lies between the state from which it was computed and the state to which it leads.
 """
 
 from __future__ import annotations
@@ -38,7 +37,10 @@ _NAME = re.compile(r'\.?(?P<task>.+)_(?P<index>\d+)_seed(?P<seed>\d+)(\.active|\
 
 
 class ReceivedAllowance:
-    """Limits how many received messages of an episode are logged, and counts the others."""
+    """Limits the received messages of an episode that are logged, by number and bytes per topic.
+
+    `omitted` is the number of messages beyond the limit, by topic.
+    """
 
     def __init__(self) -> None:
         self.omitted: Counter[str] = Counter()
@@ -48,10 +50,10 @@ class ReceivedAllowance:
     def accepts(
         self, topic: str, size: int, has_room: bool = True, *, is_refused: bool = False
     ) -> bool:
-        """Return whether a received message of `size` bytes is logged.
+        """Count a received message of `size` bytes; return whether to log it.
 
-        Messages that the robot rejected (`is_refused`) get at most half of the allowance, so that a
-        flood of them leaves room for the messages that decide the episode. They are counted as
+        Messages that the robot rejected (`is_refused`) may use at most half of the allowance, so
+        that many of them leave room for valid messages. `omitted` lists them as
         `<topic> (refused)`.
         """
         share = 2 if is_refused else 1
@@ -69,23 +71,23 @@ class ReceivedAllowance:
 
 
 class EpisodeWriter:
-    """A rosbag2 bag that appears in a directory under its name when it is complete.
+    """Writes one episode as a rosbag2 bag.
 
-    It is written in the hidden directory `.<name>.active`, from which `finish` makes a valid bag. A
-    killed process leaves the hidden directory behind, see `find_leftovers`.
+    The bag is written into the hidden directory `.<name>.active`; `finish` completes it and renames
+    the directory to `<name>`. A killed process leaves the hidden directory behind, see
+    `find_leftovers`.
 
-    The simulation can continue after every error of the disk. Such an error is raised once. Then
-    `write_tick` returns False and `finish` returns None. Not thread-safe, and not for use in signal
-    handlers.
+    A disk error is raised once. After it, `write_tick` returns False and `finish` returns None, so
+    the simulation can continue. Not thread-safe, and not for use in signal handlers.
 
-    Files stay within the limits of readers. Received messages have an allowance; the record
-    `episode_result` counts the messages beyond it.
+    The number of received messages is limited; the record `episode_result` counts those beyond the
+    limit.
 
     Raises:
         EpisodeExistsError: If the name is taken; episodes are never overwritten.
-        EpisodeLogError: If the disk is too full or the file cannot be written; then no file is left
+        EpisodeLogError: If the disk is too full or the file cannot be written. Then no file is left
             behind.
-        ValueError: If metadata or attachments are too long, or metadata are not strings.
+        ValueError: If metadata or attachments are too long.
     """
 
     def __init__(
@@ -127,10 +129,11 @@ class EpisodeWriter:
             raise EpisodeLogError(f'cannot log episode {self._final}: {_reason(error)}') from error
 
     def write_tick(self, stamp_ns: int, messages: Iterable[tuple[TopicSpec, bytes]]) -> bool:
-        """Append the messages (topic, CDR bytes) of a tick; return False after the end or an error.
+        """Append the messages (topic, CDR bytes) of a tick; return False if writing has stopped.
 
-        The first error of the disk, and an episode beyond the limits of readers, raise
-        EpisodeLogError. The part before can be recovered.
+        Raises:
+            EpisodeLogError: At the first disk error, or if the episode is too long. The part
+                written before can be recovered.
         """
         self._tick_ns, self._rank = stamp_ns, 0
         for topic, data in messages:
@@ -143,9 +146,11 @@ class EpisodeWriter:
     def write_received(self, topic: TopicSpec, data: bytes, *, is_refused: bool = False) -> bool:
         """Append a message received since the last tick; return whether it is logged.
 
-        It follows the messages of the tick. `is_refused` marks messages that the robot rejected,
-        which have a smaller allowance. Before the first tick a ValueError is raised, because
-        earlier commands are not part of the episode.
+        `is_refused` marks messages that the robot rejected, which have a smaller allowance.
+
+        Raises:
+            EpisodeLogError: As in `write_tick`.
+            ValueError: Before the first tick: earlier messages are not part of the episode.
         """
         if not self._is_open:
             return False
@@ -156,7 +161,7 @@ class EpisodeWriter:
         return self._append(topic, data)
 
     def flush(self) -> None:
-        """Write all messages to the operating system; EpisodeLogError if the disk fails."""
+        """Pass all messages to the operating system; EpisodeLogError if the disk fails."""
         if self._is_open:
             try:
                 self._bag.flush()
@@ -166,16 +171,18 @@ class EpisodeWriter:
 
     @property
     def has_unflushed(self) -> bool:
-        """True if the operating system does not have all messages yet."""
+        """True if a message was not yet passed to the operating system."""
         return self._is_open and self._bag.has_unflushed
 
     def finish(self, result: Mapping[str, str], reason: str | None = None) -> Path | None:
         """Complete the bag and return its directory.
 
-        `result` is the record `episode_result`; `complete` is added. A reason marks an episode that
-        was cut short. Returns None, without a bag,
-        if writing failed before or there is no message. If the bag cannot be completed,
-        EpisodeLogError is raised and the hidden directory stays.
+        Args:
+            result: The record `episode_result`; `complete` and `reason` are added.
+            reason: Why the episode was cut short; None if it ended normally.
+
+        Returns None if writing failed before or there is no message. If the bag cannot be
+        completed, EpisodeLogError is raised and the hidden directory stays.
         """
         self.end(result, reason)
         return self.store()
@@ -183,8 +190,8 @@ class EpisodeWriter:
     def end(self, result: Mapping[str, str], reason: str | None = None) -> bool:
         """Do the first half of `finish`: write the last messages, the result and the summary.
 
-        If the process is killed after this, recovery finds the whole episode. Returns whether there
-        is a bag to `store`.
+        If the process is killed after this, recovery finds the whole episode. Returns False if
+        there is no bag to `store`.
         """
         record = {**result, 'complete': 'true' if reason is None else 'false'}
         if reason is not None:
@@ -205,7 +212,7 @@ class EpisodeWriter:
         return True
 
     def store(self) -> Path | None:
-        """Do the second half of `finish`: flush to the disk, then give the bag its name."""
+        """Do the second half of `finish`: flush to disk (fsync), rename the hidden directory."""
         if self._description is None:
             return self._completed
         try:
@@ -219,7 +226,7 @@ class EpisodeWriter:
         return self._completed
 
     def discard(self) -> None:
-        """Remove the files of an episode that is not completed."""
+        """Remove the files of an episode that is still being written."""
         if self._is_open:
             self._stop()
             shutil.rmtree(self._active, ignore_errors=True)
@@ -257,12 +264,12 @@ def _reason(error: OSError) -> str:
 
 
 def episode_name(task: str, index: int, seed: int) -> str:
-    """Return `<task>_<index>_seed<seed>`, with leading zeros so that names sort by number."""
+    """Return `<task>_<index>_seed<seed>`; leading zeros of the index sort names by number."""
     return f'{task}_{index:06d}_seed{seed}'
 
 
 def next_index(directory: Path, task: str) -> int:
-    """Return the largest index of a task plus 1, unfinished episodes included; 0 at first."""
+    """Return the index for the next episode of a task: the largest in `directory` plus 1, or 0."""
     return max((int(name['index']) + 1 for name in _names(directory, task)), default=0)
 
 
@@ -279,11 +286,11 @@ def _names(directory: Path, task: str) -> Iterator[re.Match[str]]:
 
 
 class EpisodeDirectory:
-    """Begins one episode after the other in a directory.
+    """Creates the writers of numbered episodes in a directory.
 
-    Numbers continue after those of existing episodes, so no run overwrites another. Several
-    processes may share the directory: the first one to create the hidden directory of a name owns
-    it, the others take the next number.
+    Numbers continue after those of existing episodes, so no episode is overwritten. Several
+    processes may share the directory: a number belongs to the first process that creates its hidden
+    directory, and other processes use the next number.
     """
 
     def __init__(self, path: Path | str, namespace: str = '/') -> None:

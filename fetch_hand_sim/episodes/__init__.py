@@ -1,1 +1,1 @@
-"""Episodes: how they run, how they are logged, checked and exported."""
+"""Run episodes, log them, and check the logs."""

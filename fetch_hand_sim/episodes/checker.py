@@ -45,12 +45,12 @@ _NOT_SIMULATED = {'reason', 'received_not_logged', 'late_commands'}
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """Where a recorded episode first differs from the one simulated again.
+    """A difference between a recorded episode and the same episode simulated again.
 
     Attributes:
         tick: Number of the tick, 0 for the reset.
-        stamp_ns: Its recorded stamp.
-        field: Topic and field of its message, or another part of the file.
+        stamp_ns: Recorded stamp of the tick.
+        field: Topic and field of the message, or another part of the file such as `metadata seed`.
         recorded: Recorded value, shortened.
         simulated: Simulated value, shortened.
     """
@@ -69,7 +69,7 @@ class Difference:
 
 
 def _short(text: str) -> str:
-    """Return the first characters of a hash or version, with the `-dirty` of a revision."""
+    """Shorten a hash or version to 12 characters; keep the suffix `-dirty` of a revision."""
     return text[:12] + ('-dirty' if text.endswith('-dirty') else '')
 
 
@@ -82,15 +82,15 @@ def _difference(
 
 @dataclass(slots=True)
 class CheckResult:
-    """Result of a check.
+    """Result of the check of one episode.
 
     Attributes:
         path: The MCAP file.
         ticks: Number of identical ticks.
-        messages: Number of messages in them.
-        unchecked: Messages of a last tick that was cut off before its command.
-        difference: The first difference, or None.
-        changed: Software that is not the recorded one: `name recorded -> here`.
+        messages: Number of published messages in the identical ticks.
+        unchecked: Number of messages in an incomplete last tick, which cannot be checked.
+        difference: The first difference; None if the episode is identical.
+        changed: Software versions that differ from the recorded ones: `name recorded -> here`.
     """
 
     path: Path
@@ -111,7 +111,10 @@ class CheckResult:
 
 @lru_cache(maxsize=1)
 def _reference(task: str, **rules: Any) -> tuple[Simulation, RecordingContext, str]:
-    """Return a simulation, its context and its former fingerprint; made once for equal rules."""
+    """Return a simulation, its recording context and the model hash that version 1.0 recorded.
+
+    The last result is cached, because most episodes of a folder have the same settings.
+    """
     simulation = Simulation(task, num_threads=1, **rules)
     context = RecordingContext(simulation, with_compiled_model=False)
     return simulation, context, former_model_sha256(simulation.model)
@@ -121,8 +124,7 @@ def check_episode(path: Path) -> CheckResult:
     """Simulate an episode again and compare it; `path` is a bag directory or MCAP file.
 
     Raises:
-        EpisodeReadError: If the file is damaged or ambiguous, or the episode cannot be simulated
-            from its records.
+        EpisodeReadError: If the file is invalid, or lacks data to simulate the episode again.
     """
     episode = read_episode(path)
     ticks = split_ticks(episode)
@@ -169,7 +171,7 @@ def check_episode(path: Path) -> CheckResult:
 def _start_differences(
     episode: Episode, stamp_ns: int, here: dict[str, str], mjcf: bytes, result: CheckResult
 ) -> Iterator[Difference]:
-    """Yield differences from the metadata and the model here; note changed software."""
+    """Compare the metadata and the model; add changed software to `result` and yield the rest."""
     recorded = episode.metadata
     for name, value in here.items():
         is_software = name in _SOFTWARE or name.endswith('_version')
@@ -186,7 +188,7 @@ def _start_differences(
 
 
 def _topic_differences(episode: Episode, ticks: list[LoggedTick]) -> Iterator[Difference]:
-    """Yield differences of type hash, quality of service, publish times and sequence numbers."""
+    """Yield differences of type hashes, QoS profiles, publish times and sequence numbers."""
     stamps = [tick.stamp_ns for tick in ticks]
     for name, spec in logged_topics(episode).items():
         logged = episode.topics[name]
@@ -256,16 +258,16 @@ def _differences(
 
 
 def _require_goals(episode: Episode) -> None:
-    """Raise `ValueError` if goals or pushes were received that the file does not contain."""
+    """Raise `ValueError` if the robot received goals or pushes that the file lacks."""
     for name in ('set_goal', 'perturb'):
         if name in episode.outcome.received_not_logged:
             raise ValueError(f'the file lacks some of the received messages of {name}')
 
 
 def _as_of(interface_version: int, tick: Tick) -> Tick:
-    """Return the tick as a robot of an older version publishes it.
+    """Return the tick as a robot of an older interface version publishes it.
 
-    In version 1 the orientations of `fingertip_poses` were identity.
+    In version 1 all orientations in `fingertip_poses` were the identity.
     """
     if interface_version != 1 or 'fingertip_poses' not in tick.readings:
         return tick
@@ -277,7 +279,7 @@ def _as_of(interface_version: int, tick: Tick) -> Tick:
 def _result_differences(
     last: LoggedTick, status: EpisodeStatus, runner: EpisodeRunner, episode: Episode
 ) -> Iterator[Difference]:
-    """Compare the record `episode_result` with the last tick."""
+    """Yield differences between the record `episode_result` and the last simulated tick."""
     # An interrupted recording can contain all ticks and no end of the episode.
     is_whole = runner.is_between_episodes and episode.result.get('complete') != 'false'
     expected = {**episode_result(status), 'complete': 'true' if is_whole else 'false'}
@@ -299,7 +301,7 @@ def _applied_command(logged: LoggedTick) -> Array | None:
 
 
 class _Received:
-    """Applies the logged commands, goals and pushes as `sim_node` does."""
+    """Applies the logged received messages (commands, goals, pushes) as `sim_node` does."""
 
     def __init__(self, runner: EpisodeRunner, episode: Episode, record: EpisodeRecord) -> None:
         self._runner = runner
@@ -310,7 +312,7 @@ class _Received:
         self._lacks_commands = is_recovered or bool(_COMMANDS & outcome.received_not_logged.keys())
 
     def differences(self, number: int, command: Array) -> Iterator[tuple[str, object, object]]:
-        """Compare the applied command of a tick with the last valid one received before it."""
+        """Yield a difference if tick `number` did not apply the last valid command before it."""
         if not number:
             self._commands.start_episode(self._runner.resting_command())
         if not self._lacks_commands and self._commands.has_fresh_command:
@@ -319,7 +321,7 @@ class _Received:
                 yield 'applied_command', command, f'{received} received'
 
     def take(self, logged: LoggedTick) -> None:
-        """Apply the messages received after the tick `logged`."""
+        """Apply the messages that the robot received between the tick `logged` and the next."""
         for each in logged.received:
             with suppress(ValueError):
                 message = deserialize(each.topic.type_name, each.data)
@@ -342,7 +344,7 @@ def _tick_differences(
     stamp_ns: int,
     expected: list[tuple[TopicSpec, bytes]],
 ) -> Iterator[tuple[str, object, object]]:
-    """Yield field, recorded and simulated value of each difference in the messages of a tick."""
+    """Yield (field, recorded value, simulated value) for differences in the messages of a tick."""
     names = [message.topic.name for message in logged.published]
     wanted = [topic.name for topic, _ in expected]
     for index, (name, other) in enumerate(zip_longest(names, wanted, fillvalue='nothing')):
@@ -359,7 +361,7 @@ def _tick_differences(
 
 
 def _field_difference(topic: TopicSpec, recorded: bytes, simulated: bytes) -> tuple[str, str, str]:
-    """Return the first field in which two messages differ, and its two values."""
+    """Return the first field in which two messages differ, with both values as text."""
     try:
         first, second = (deserialize(topic.type_name, data) for data in (recorded, simulated))
     except ValueError:

@@ -1,8 +1,8 @@
 """The newest valid command of a robot.
 
-As ros2_control's forward_command_controller does: commands of a wrong size or with values that are
-not finite are dropped and counted, values out of range are clipped, nothing is applied before the
-first valid command, and after the timeout the robot holds.
+Rules as in ros2_control's forward_command_controller: Commands of a wrong size, or with values that
+are not finite, are rejected and counted. Values out of range are clipped. The robot rests before
+the first valid command, and holds its position if no command arrives within the timeout.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ _FAR = 2.0
 
 
 class CommandBuffer:
-    """The newest valid command of one robot.
+    """Checks and stores the newest command of one robot.
 
     The robot holds after `timeout` seconds without a command; 0 means never.
 
     Attributes:
-        far_out: Clipped commands far out of range, probably in another unit.
-        last_far_out: The value far out of range and its limits.
-        last_rejection: Why the last command was rejected; empty if it was valid.
-        has_fresh_command: Whether a command came since the last `take` or `start_episode`.
-        answered_stamp: Stamp of the observation that the last command answers, nanoseconds; None
-            if it names none.
+        far_out: Number of commands that were far out of range, probably in another unit.
+        last_far_out: Description of the last such value and its limits.
+        last_rejection: Why the last command was rejected; '' if it was valid.
+        has_fresh_command: Whether a command arrived since the last `take` or `start_episode`.
+        answered_stamp: Stamp of the observation from which the last command was computed,
+            nanoseconds; None if the command names none.
     """
 
     def __init__(
@@ -60,30 +60,30 @@ class CommandBuffer:
 
     @property
     def has_command(self) -> bool:
-        """True if a valid command came in this episode."""
+        """True if a valid command arrived in this episode."""
         return self._command is not None
 
     def age(self) -> float | None:
-        """Return the seconds since the last valid command of any episode, or None."""
+        """Return the seconds since the last valid command of any episode; None without one."""
         return None if self._received_at is None else self._clock() - self._received_at
 
     def start_episode(self, resting_command: ArrayLike) -> None:
         """Drop the last command, because an episode starts.
 
         Args:
-            resting_command: (action size,): applies until the first command, and is the base of
-                commands that name only some joints.
+            resting_command: (action size,) applies until the first command. Joints that a first
+                named command does not name keep these values.
         """
         self._resting = np.array(resting_command, dtype=np.float64)
         self._command = None
         self.has_fresh_command = False
 
     def accept(self, values: ArrayLike, answered_stamp: int | None = None) -> None:
-        """Store a whole command, in order, or raise ValueError and change nothing.
+        """Store a command for all joints; ValueError, and no change, if it is invalid.
 
         Args:
-            values: (action size,).
-            answered_stamp: Stamp of the observation that it answers, nanoseconds, if known.
+            values: (action size,) in the order of the robot's commands, command units.
+            answered_stamp: Stamp of the observation from which it was computed, nanoseconds.
         """
         command = np.asarray(values, dtype=np.float64).ravel()
         size = self._robot.action_size
@@ -92,7 +92,7 @@ class CommandBuffer:
         self._store(command, answered_stamp)
 
     def accept_named(self, names: Sequence[str], positions: ArrayLike) -> None:
-        """Store joint positions by name, or raise ValueError; other joints keep their target."""
+        """Store targets of some joints by name; others keep theirs. ValueError if invalid."""
         values = np.asarray(positions, dtype=np.float64).ravel()
         if len(names) != values.size:
             self._reject('wrong size', f'{len(names)} names but {values.size} positions given')
@@ -111,16 +111,16 @@ class CommandBuffer:
         self._store(command)
 
     def count_rejection(self, reason: str, line: str) -> None:
-        """Count an unusable message, by its short `reason`; `line` describes it in full."""
+        """Count a rejected message under the short `reason`; `line` is the full description."""
         self.rejected[reason] += 1
         self.last_rejection = line
 
     def take(self) -> Array:
         """Return the command of the next tick, (action size,), command units, within limits.
 
-        Without a command in this episode it is the resting command. After `timeout` seconds without
-        a new one it is the command that holds. A command that came since the last tick always
-        applies, however slow the ticks are.
+        This is the resting command before the first command of the episode. After `timeout` seconds
+        without a new command, it holds the robot. A command that arrived since the last tick always
+        applies, even if it is older than `timeout`.
         """
         is_fresh, self.has_fresh_command = self.has_fresh_command, False
         if self._command is None:
@@ -129,7 +129,7 @@ class CommandBuffer:
         return self._holding(self._command) if is_late else self._command
 
     def _holding(self, command: Array) -> Array:
-        """Return the command that holds: the gripper keeps its grip, joints keep their targets."""
+        """Return the command that holds the robot: the arm stops, grip and joint targets stay."""
         if not self._robot.has_gripper_command:
             return command
         keeps = [part.name == 'gripper' for part in self._robot.command]

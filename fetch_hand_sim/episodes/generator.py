@@ -1,7 +1,7 @@
-"""Log episodes by the thousand with the batched simulation.
+"""Run and log many episodes in parallel with the batched simulation.
 
-The files equal those of `sim_node` in lockstep under the same commands: same messages, stamps, log
-times and metadata keys.
+For the same commands, `sim_node` in lockstep writes the same messages, stamps, log times and
+metadata keys.
 """
 
 from __future__ import annotations
@@ -39,17 +39,20 @@ _COMPLETING_THREADS = 4
 
 @dataclass(frozen=True, slots=True)
 class _Robot:
-    """One robot of the batch in one episode; stamp, messages and received command of each tick."""
+    """One robot of the batch in one episode.
+
+    `messages` contains stamp, published messages and received command of each tick so far.
+    """
 
     episode: RobotEpisode
     messages: list[tuple[int, list[Any], bytes | None]] = field(default_factory=list)
 
 
 class EpisodeGenerator:
-    """Runs a policy in all robots of a simulation and logs every episode.
+    """Runs a policy in all N robots of a simulation and logs every episode.
 
-    `act` returns actions (N, action size) in [-1, 1]. `on_start` receives the seeds (N,) of the
-    episodes that begin.
+    The policy `act` maps observations to actions (N, action size) in [-1, 1]. `on_start` is called
+    with the N seeds whenever episodes begin.
     """
 
     def __init__(
@@ -71,13 +74,14 @@ class EpisodeGenerator:
         self._period_ns = round(simulation.tick_duration * 1e9)
 
     def generate(self, episodes: int, first_seed: int = 0) -> Iterator[LoggedEpisode]:
-        """Yield the episodes, in order, as their files are completed.
+        """Yield the logged episodes, in order, as their files are completed.
 
-        Episode i has the seed `first_seed + i` and the stamps of a series of one robot.
+        Episode i has the seed `first_seed + i`. Its stamps are those of one robot that runs all
+        episodes one after the other.
 
         Raises:
             EpisodeLogError: If a file cannot be written.
-            KeyboardInterrupt: At Ctrl-C, after the finished episodes.
+            KeyboardInterrupt: At Ctrl-C, after finished episodes were yielded.
         """
         with ThreadPoolExecutor(_COMPLETING_THREADS, 'episode_log') as pool:
             waiting: deque[Future[LoggedEpisode]] = deque()
@@ -100,7 +104,7 @@ class EpisodeGenerator:
         return _Robot(RobotEpisode(self._simulation, episode, first_seed + episode, stamp_ns))
 
     def _run(self, robots: Sequence[_Robot], first_seed: int) -> None:
-        """Run one episode in each of `robots`; the simulation may have more, not logged."""
+        """Run one episode in each of `robots`; further robots of the simulation are not logged."""
         simulation, robot_spec = self._simulation, self._simulation.spec.robot
         simulation.reset(seed=first_seed)
         if self._on_start is not None:
@@ -123,12 +127,12 @@ class EpisodeGenerator:
                     self._take(robot, tick)
 
     def _take(self, robot: _Robot, tick: Tick) -> None:
-        """Encode the messages of a tick and append them to the robot's episode."""
+        """Encode the messages of a tick and append them to `robot.messages`."""
         messages = self._encoder.encode(tick, latched=tick.status.phase != 'running')
         robot.messages.append((tick.stamp_ns, messages, None))
 
     def _receive(self, robots: Sequence[_Robot], commands: Array) -> None:
-        """Append to each robot's episode the command message that `policy_node` would send."""
+        """Encode the commands as `policy_node` does and add them to the last ticks of `robots`."""
         for robot, command in zip(robots, commands, strict=False):
             if not robot.episode.is_finished:
                 stamp_ns, messages, _ = robot.messages[-1]
@@ -157,7 +161,7 @@ class EpisodeGenerator:
 
 
 def _completed(waiting: deque[Future[LoggedEpisode]]) -> Iterator[LoggedEpisode]:
-    """Yield the files in order as they are completed; Ctrl-C leaves the others in `waiting`."""
+    """Yield the results in order and remove them from `waiting`; Ctrl-C leaves the others there."""
     while waiting:
         logged = waiting[0].result()
         waiting.popleft()

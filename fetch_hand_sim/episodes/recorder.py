@@ -1,9 +1,9 @@
 """Log the ticks of a running robot, episode by episode, without delaying the robot.
 
-A tick puts its messages into a queue. One thread writes them; another waits for the disk, which a
-finished file has to. A killed robot loses the messages that the operating system does not have yet:
-a quarter of a second of wall-clock time at most, at every rate, because a robot that is faster than
-its disk waits. A disk that fails stops logging, never the robot.
+Each tick puts its messages into a queue. One thread writes them, another flushes finished files to
+the disk (fsync). If the process is killed, at most the last 0.25 s of wall-clock time are lost; to
+ensure this, the robot waits if the disk is slower. If the disk fails, logging stops but the robot
+continues.
 """
 
 from __future__ import annotations
@@ -63,10 +63,10 @@ DIVERGED = 'diverged'
 
 
 class RecordingContext:
-    """Makes the attachments and the metadata for the episode files of one simulation.
+    """Creates the attachments and the metadata for the episode files of one simulation.
 
-    Every episode contains the MJCF text; `with_compiled_model` adds the compiled model, 3 MB. The
-    largest force of a push, `perturb_limit`, is in N.
+    Every file contains the MJCF text. `with_compiled_model` adds the compiled model, 3 MB.
+    `perturb_limit` is the largest force of a push, N.
     """
 
     def __init__(
@@ -87,7 +87,7 @@ class RecordingContext:
         self.checkpoint_sha256: str | None = None
 
     def metadata(self, status: EpisodeStatus) -> dict[str, str]:
-        """Return the metadata record `episode` for an episode with this first status."""
+        """Return the metadata record `episode`; `status` is the first status of the episode."""
         return episode_metadata(
             self._simulation.spec.with_joint_prefix(status.joint_prefix),
             episode=status.episode,
@@ -109,7 +109,7 @@ class RecordingContext:
 
 @dataclass(frozen=True, slots=True)
 class LoggedEpisode:
-    """A completed file."""
+    """A logged episode: its last status and its bag; `is_complete` is False if it was cut short."""
 
     status: EpisodeStatus
     path: Path
@@ -121,11 +121,11 @@ class EpisodeRecorder:
     """Writes each episode of a robot to a bag of its own.
 
     Args:
-        metadata: Makes the metadata of an episode from the status of its first tick, when it is
-            recorded.
-        on_error: Called once, with one line, when the disk fails, by any thread.
-        on_logged: Called for every completed file, by a thread of its own.
-        on_slow: Called with one line, now and then, when the robot has to wait for the disk.
+        directory: Folder of the bags.
+        metadata: Returns the metadata of a new episode; called with its first status.
+        on_error: Called once, with one line, when logging fails; from any thread.
+        on_logged: Called for every completed file; from a thread of the recorder.
+        on_slow: Called with one line, at most every 10 s, when the robot waits for the disk.
     """
 
     def __init__(
@@ -169,7 +169,7 @@ class EpisodeRecorder:
             thread.start()
 
     def record(self, tick: Tick, messages: Messages) -> None:
-        """Log a tick: a reset begins a file, a finished episode completes it."""
+        """Log a tick; the reset of an episode begins a file, its last tick completes the file."""
         if tick.status.phase == 'reset':
             self._end('reset before the end')
             if not self.has_failed:
@@ -183,16 +183,17 @@ class EpisodeRecorder:
             self._end(DIVERGED if tick.has_diverged else None)
 
     def record_received(self, topic: TopicSpec, data: bytes, *, is_refused: bool = False) -> None:
-        """Log a message received since the last tick; between episodes it belongs to no file."""
+        """Log a message received since the last tick; drop it between two episodes."""
         if self._last_tick is not None:
             self._put(partial(self._write_received, topic, data, is_refused))
 
     def close(self, reason: str, gives_up: Callable[[], bool] = lambda: False) -> None:
-        """Complete all files and wait for the disk.
+        """Complete all files and wait until they are on the disk.
 
         Args:
-            gives_up: Called during the wait. When it returns True, the unfinished files are left
-                for `fetch_hand_sim episodes recover`.
+            reason: End reason of an episode that is still running.
+            gives_up: Called during the wait; True ends it. Then `fetch_hand_sim episodes recover`
+                can complete the unfinished files.
         """
         self._end(reason)
         self._tasks.put(None)
@@ -211,13 +212,13 @@ class EpisodeRecorder:
     # The robot's thread
 
     def _end(self, reason: str | None) -> None:
-        """Complete the running episode, if any; with a reason, marked as cut short."""
+        """Complete the file of the running episode, if any; a reason marks it as cut short."""
         tick, self._last_tick = self._last_tick, None
         if tick is not None:
             self._put(partial(self._finish, tick, reason))
 
     def _put(self, task: Task) -> None:
-        """Queue a task; wait if the queue is full, because the disk is slower than the robot."""
+        """Queue a task for the writing thread; wait first if that thread is 0.2 s behind."""
         if self.has_failed:
             return
         began = now = progressed = time.monotonic()
@@ -235,7 +236,7 @@ class EpisodeRecorder:
             self._report_slow(now)
 
     def _oldest(self, now: float) -> float:
-        """Return when the oldest message came that is not yet written to the operating system."""
+        """Return when the oldest message arrived that is not yet passed to the operating system."""
         since = self._unflushed_since
         if since is not None:
             return since
@@ -344,7 +345,7 @@ class EpisodeRecorder:
 
 
 def episode_result(status: EpisodeStatus, late_commands: int | None = None) -> dict[str, str]:
-    """Return the metadata record `episode_result` of an episode with this last status."""
+    """Return the metadata record `episode_result`; `status` is the last status of the episode."""
     return EpisodeOutcome(
         steps=status.tick,
         episode_return=status.episode_return,
@@ -365,9 +366,9 @@ _LEFT_OUT = frozenset({*_OF_PATHS, 'nbuffer', 'signature'})
 
 
 def model_sha256(model: mujoco.MjModel) -> str:
-    """Return the fingerprint of a model, equal for equal models on one MuJoCo version.
+    """Return a hash of a compiled model, the same on all machines with one MuJoCo version.
 
-    The place of its meshes and textures does not count: it differs between machines.
+    It does not depend on the paths of mesh and texture files.
     """
     digest = hashlib.sha256()
     for name, content in _contents(model):
@@ -377,12 +378,12 @@ def model_sha256(model: mujoco.MjModel) -> str:
 
 
 def former_model_sha256(model: mujoco.MjModel) -> str:
-    """Return the fingerprint that logs up to version 1.0 have; it depends on file paths."""
+    """Return the model hash of logs up to version 1.0, which depends on file paths."""
     return hashlib.sha256(compiled_bytes(model)).hexdigest()
 
 
 def _contents(struct: Any, prefix: str = '') -> Iterator[tuple[str, bytes]]:
-    """Yield name and bytes of each field of a MuJoCo structure, nested ones included."""
+    """Yield name and bytes of each field of a MuJoCo structure and its nested structures."""
     for name in dir(struct):
         if name.startswith('_') or name in _LEFT_OUT:
             continue
@@ -396,12 +397,12 @@ def _contents(struct: Any, prefix: str = '') -> Iterator[tuple[str, bytes]]:
 
 
 def mjcf_attachment(path: Path) -> Attachment:
-    """Return the MJCF at `path` as one text, with included files and without meshes."""
+    """Return the MJCF file at `path` as one text that contains the files it includes, no meshes."""
     text = mujoco.MjSpec.from_file(str(path)).to_xml()
     return Attachment('model.xml', 'application/xml', text.encode())
 
 
 def compiled_attachment(model: mujoco.MjModel) -> Attachment:
-    """Return the compiled model, compressed with zstd to 3 MB; make it once for all episodes."""
+    """Return the compiled model, compressed with zstd to 3 MB; this is slow."""
     data = zstandard.ZstdCompressor(level=10).compress(compiled_bytes(model))
     return Attachment('model.mjb.zst', 'application/zstd', data)

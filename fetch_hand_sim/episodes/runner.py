@@ -1,7 +1,7 @@
-"""Episodes of one robot, tick by tick: command in, `Tick` out.
+"""Run the episodes of one robot tick by tick; each command leads to a `Tick`.
 
-This module is independent of ROS, of files and of wall-clock time. So real time, lockstep and a
-Python loop give the same ticks for the same commands.
+This module uses no ROS, files or wall-clock time. So real time, lockstep and a Python loop give the
+same ticks for the same commands.
 """
 
 from __future__ import annotations
@@ -30,15 +30,15 @@ _SEEDS = 2**32
 
 @dataclass(frozen=True, slots=True)
 class Sensed:
-    """Readings, goals and rewards of all robots of a simulation at one tick.
+    """Readings, goals and rewards of all N robots of a simulation at one tick.
 
     Attributes:
-        readings: Readings of the sensors, (N, size) each.
-        true_readings: The same without disturbances; None if disturbances are off.
-        achieved: (N, goal size).
-        desired: (N, goal size).
+        readings: Sensor readings by name, (N, size) each.
+        true_readings: Readings without disturbances; None if disturbances are off.
+        achieved: Achieved goals, (N, goal size).
+        desired: Desired goals, (N, goal size).
         reward: (N,).
-        success: (N,): whether the goal is reached.
+        success: (N,) whether the goal is reached.
     """
 
     readings: Readings
@@ -61,12 +61,12 @@ def sense(simulation: Simulation) -> Sensed:
 
 
 def has_ended(ticks: Any, episode_ticks: int, has_diverged: Any) -> Any:
-    """Return whether episodes are over: time is up or the simulation diverged."""
+    """Return whether episodes have ended: after `episode_ticks` ticks or at divergence."""
     return has_diverged | (ticks >= episode_ticks)
 
 
 class RobotEpisode:
-    """One episode of one robot among N, from its reset until time is up or it diverges."""
+    """Makes the ticks of one episode of one robot of a simulation."""
 
     def __init__(
         self,
@@ -90,11 +90,11 @@ class RobotEpisode:
 
     @property
     def is_finished(self) -> bool:
-        """True after its last tick."""
+        """True after the last tick of the episode."""
         return self.status.phase == 'finished'
 
     def start(self, sensed: Sensed, index: int) -> Tick:
-        """Return tick 0, right after the reset, of robot `index`."""
+        """Return tick 0 of robot `index`; `sensed` is its state right after the reset."""
         disturbances = self._simulation.disturbances
         if not disturbances.is_off:
             self._disturbances = disturbances.to_json()
@@ -102,7 +102,7 @@ class RobotEpisode:
         return self._make_tick('reset', sensed, index, None)
 
     def step(self, sensed: Sensed, index: int, command: Array, has_diverged: bool) -> Tick:
-        """Return the tick of robot `index` after a step with the applied command (action size,)."""
+        """Return the tick of robot `index` after a step that applied `command` (action size,)."""
         self.tick += 1
         self._return += float(sensed.reward[index])
         self.has_diverged = has_diverged
@@ -147,21 +147,21 @@ class RobotEpisode:
 class EpisodeRunner:
     """Runs episodes one after the other on a `Simulation` of one robot.
 
-    Each reset takes a tick of its own: `advance` starts an episode when `is_between_episodes`, and
-    steps it otherwise. Episode i has the seed `first_seed + i` until `set_next_seed` is called.
-    Stamps grow by one period per tick and never go back.
+    The reset of an episode is a tick, too. Episode i has the seed `first_seed + i` until
+    `set_next_seed` is called. Stamps grow by one period per tick and never go back.
 
     Args:
         episodes: Number of episodes to run; 0 for no end.
-        first_episode: Index of the first episode, to repeat an episode from the middle of a series.
-        first_stamp_ns: Simulated time of the first tick, likewise.
+        first_episode: Index of the first episode. To repeat one episode of a series, pass its index
+            here and its first stamp as `first_stamp_ns`.
+        first_stamp_ns: Simulated time of the first tick.
 
     Attributes:
         spec: The task, with the joint names of the messages.
         episode: Index of the running or next episode, from 0.
-        current: The running or last episode; before the first tick the first episode, waiting.
-        stamp_ns: Simulated time of the last tick; before the first tick one period less than its
-            time.
+        current: The running or last episode; before the first tick the first episode, in the phase
+            `waiting`.
+        stamp_ns: Simulated time of the last tick; one period before `first_stamp_ns` at first.
         is_between_episodes: Whether the next tick is a reset.
     """
 
@@ -215,12 +215,12 @@ class EpisodeRunner:
         return self._make_episode(self.stamp_ns).status
 
     def resting_command(self) -> Array:
-        """Return the command (action size,) that keeps the robot in its state."""
+        """Return the command (action size,) at which the robot stays in its present position."""
         (command,) = self.simulation.resting_commands()
         return np.asarray(command)
 
     def set_next_seed(self, seed: int) -> None:
-        """Set the seed of the next episode; later episodes have the seeds that follow."""
+        """Set the seed of the next episode; each later episode has the seed before it plus 1."""
         following = self.episode if self.is_between_episodes else self.episode + 1
         self._new_first_seed = seed - following
         self._series_seed = seed - self._first_episode
@@ -230,14 +230,14 @@ class EpisodeRunner:
         self._new_disturbances = disturbances
 
     def end_episode(self) -> None:
-        """End the running episode; the next tick starts another."""
+        """End the running episode, if any; the next tick is the reset of the next episode."""
         if not self.is_between_episodes:
             self._finish()
 
     def start_over(self) -> None:
-        """Start the series again with the next tick; stamps continue to grow.
+        """Make the next tick the reset of the first episode; stamps continue to grow.
 
-        The first episode has its first seed, or the seed that was set last.
+        The first episode has the first seed, or the seed of the last `set_next_seed`.
         """
         self.is_between_episodes = True
         self.episode = self._first_episode
@@ -291,9 +291,9 @@ _WITHIN = 1.0 - 1e-9
 def accept_goal(
     runner: EpisodeRunner, topic: TopicSpec, message: Any, *, reads_header: bool = True
 ) -> None:
-    """Replace the goal of the running episode from the next tick on, or raise ValueError.
+    """Replace the goal of the running episode from the next tick on; ValueError if it is invalid.
 
-    Robots of interface version 1 ignored frame and stamp (`reads_header=False`).
+    `reads_header=False` ignores frame and stamp, as robots of interface version 1 did.
     """
     if runner.is_between_episodes:
         raise ValueError('no episode is running')
@@ -309,7 +309,7 @@ def accept_goal(
 
 
 def _check_stamp(runner: EpisodeRunner, stamp_ns: int) -> None:
-    """Raise ValueError for the stamp of a goal that is before the episode or in the future."""
+    """Raise ValueError if the stamp of a goal is before the running episode or in the future."""
     first, last = runner.current.first_stamp_ns, runner.stamp_ns
     if stamp_ns and not first <= stamp_ns <= last:
         raise ValueError(
@@ -319,9 +319,9 @@ def _check_stamp(runner: EpisodeRunner, stamp_ns: int) -> None:
 
 
 def bounded_wrench(wrench: Array, limit: float) -> Array:
-    """Scale a wrench (6,), N and N m, down to the limits; one within them is unchanged.
+    """Scale a wrench (6,), N and N m, down if its force or torque is beyond the limits.
 
-    `limit` is the largest force, N; force and torque keep their directions.
+    `limit` is the largest force, N; it also determines the largest torque. Directions stay.
     """
     force, torque = _sizes(wrench)
     share = max(force / limit, torque / (_LEVER * limit))
@@ -332,9 +332,9 @@ def bounded_wrench(wrench: Array, limit: float) -> Array:
 def accept_perturbation(
     runner: EpisodeRunner, topic: TopicSpec, message: Any, limit: float
 ) -> None:
-    """Push a body during the next tick of the episode, or raise ValueError.
+    """Push a body during the next tick of the running episode; ValueError if this is not allowed.
 
-    `limit` is the largest force, N; 0 rejects all.
+    `limit` is the largest force, N; 0 rejects all pushes.
     """
     if not limit:
         raise ValueError('perturbations are off; perturb_limit:=10.0 at the start allows 10 N')
