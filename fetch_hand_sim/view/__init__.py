@@ -1,7 +1,7 @@
 """`view`: show a running robot, or episode files, on a page in the browser.
 
-`live.py` follows a robot over ROS, `player.py` plays files. `page/` draws them in MuJoCo's web
-viewer, which `web.py` serves behind `guard.py`.
+`live.py` follows a robot over ROS, `player.py` plays files. `page/` draws both in MuJoCo's web
+viewer. `web.py` serves this viewer, and `guard.py` checks all requests.
 """
 
 from __future__ import annotations

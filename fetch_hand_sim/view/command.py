@@ -27,7 +27,7 @@ _DESCRIPTION = (
 
 
 def _namespace(text: str) -> str:
-    """Return a namespace without the slashes around it."""
+    """Check a namespace for argparse and remove the slashes around it."""
     inner = text.strip('/')
     if _is_namespace(inner):
         return inner
@@ -44,7 +44,7 @@ def _is_namespace(text: str) -> bool:
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
-    """Parse the command line; arguments after `--ros-args` are for ROS."""
+    """Parse and check the command line; `ros_arguments` are those from `--ros-args` on."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     cut = words.index('--ros-args') if '--ros-args' in words else len(words)
     parser = CommandParser(prog='view', description=_DESCRIPTION)
@@ -80,7 +80,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
 
 
 def _given(options: argparse.Namespace, *names: str) -> str:
-    """Return which of the options `names` the user has given, as written on the command line."""
+    """Return which of the options `names` are set, as text such as `--task and --policy`."""
     return ' and '.join(f'--{name.replace("_", "-")}' for name in names if getattr(options, name))
 
 

@@ -1,4 +1,4 @@
-"""The last seconds of an episode as the page shows them: curves, trail and the newest tick."""
+"""Store what the page shows of the last ticks: curves, trail and the newest tick."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ _FINGER_RANGE = 0.05
 
 
 class Curves:
-    """Distances, reward, commands and positions of the latest ticks.
+    """Stores goal distances, rewards, commands and joint positions of the last ticks.
 
     Args:
         spec: The task.
-        metric: Measures the distance to the goal.
-        length: Number of ticks to keep.
+        metric: Computes the distance to the goal.
+        length: Number of ticks to store.
     """
 
     def __init__(self, spec: TaskSpec, metric: GoalMetric, length: int = 250) -> None:
@@ -55,7 +55,7 @@ class Curves:
         self._rows.append(np.concatenate([first, *values]))
 
     def graphs(self, ticks: int | None = None) -> Graphs:
-        """Return the curves of the first `ticks` rows, or of all."""
+        """Return the curves of the first `ticks` stored ticks; None returns all."""
         commands = len(self._commanded)
         rows = np.concatenate([[], *self._rows]).reshape(-1, 4 + 2 * commands)[:ticks]
 
@@ -71,9 +71,9 @@ class Curves:
         )
 
     def _positions(self, frame: Frame) -> Array:
-        """Return the position of the joint that each command drives.
+        """Return the positions of the joints that the commands drive, (action size,).
 
-        It is NaN for commands that move the gripper along an axis.
+        Commands that move the gripper along an axis drive no single joint and have NaN.
         """
         joints = frame.joint_position
         positions = np.array([np.nan if i is None else joints[i] for i in self._commanded])
@@ -84,7 +84,7 @@ class Curves:
 
 
 class History:
-    """The newest tick of a running robot, its trail and its `curves`."""
+    """Stores the newest tick of a running robot as `picture`, its trail and its `curves`."""
 
     def __init__(self, spec: TaskSpec, metric: GoalMetric) -> None:
         self.spec = spec
@@ -97,11 +97,11 @@ class History:
         self.curves = Curves(self.spec, metric)
 
     def begin_episode(self) -> None:
-        """Forget the trail of the episode before."""
+        """Remove the trail of the last episode."""
         self._trail.clear()
 
     def add(self, stamp_ns: int, frame: Frame, reward: float | None, command: Array | None) -> None:
-        """Append a tick; curves begin again if its time is before the last one."""
+        """Append a tick; if its stamp is before the last one, begin new curves."""
         if stamp_ns < self.picture.stamp_ns:
             self.use_metric(self.curves.metric)
         self._trail.append(tracked_position(frame))
@@ -111,7 +111,7 @@ class History:
         )
 
     def show_goal(self, goal: Array) -> None:
-        """Replace the goal of the newest tick."""
+        """Show another desired goal in the newest tick."""
         if self.picture.frame is not None:
             frame = replace(self.picture.frame, desired_goal=goal)
             self.picture = replace(self.picture, frame=frame)

@@ -1,7 +1,7 @@
-"""Access rules of the page: which requests the web server answers, and which visitor is in control.
+"""Decide which requests the web server answers, and whether the visitor in control is present.
 
 MuJoCo's viewer answers every request, loads models from visitors and lets other sites read its
-answers. `guarded_serve` checks the token, the Host and the Origin of each request before it.
+answers. `guarded_serve` first checks the token, the Host and the Origin of each request.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ _ROLE, _READ_ONLY_ROLE = b'\0Controlling\0', b'\0Watching\0\0\0\0'
 
 
 class Attendance:
-    """Records whether the page that controls the robot is in use; safe for any thread.
+    """Records whether the page in control of the robot is in use; thread-safe.
 
     Args:
         clock: A steady clock, seconds.
@@ -66,7 +66,7 @@ class Attendance:
 
     @property
     def is_there(self) -> bool:
-        """True if the page in control has sent input within the last seconds."""
+        """True if the page in control has sent input within the last 3 s."""
         return self._clock() - self._heard < _SILENCE
 
     def note(self) -> None:
@@ -79,14 +79,14 @@ class Attendance:
         self._visits += 1
 
     def has_left(self) -> bool:
-        """Return whether the page is not in use, or was closed since the last call."""
+        """Return whether the page in control is unused, or was closed since the last call."""
         visits, before = self._visits, self._known_visits
         self._known_visits = visits
         return visits != before or not self.is_there
 
 
 def is_loopback(host: str) -> bool:
-    """Return whether a host name or address can only be reached from this machine."""
+    """Return whether a host is `localhost` or a loopback address, reachable only from here."""
     try:
         return host == 'localhost' or ip_address(host).is_loopback
     except ValueError:
@@ -95,10 +95,10 @@ def is_loopback(host: str) -> bool:
 
 
 class Guard:
-    """Accepts or rejects requests.
+    """Accepts or rejects requests to the page.
 
-    Without a token, only loopback hosts are accepted: a foreign name that resolves to 127.0.0.1
-    is rejected. With a token, every request needs it. A web socket must come from the page itself.
+    Without a token, the Host header must be a loopback address, not another name that resolves to
+    it. With a token, every request needs the token. Only the page itself may open a web socket.
 
     Args:
         token: Secret that visitors need; None if only this machine can connect.
@@ -110,7 +110,7 @@ class Guard:
         self._cookie = _COOKIE.format(port=port)
 
     def refusal(self, target: str, headers: Headers) -> Response | None:
-        """Return the error response to a request for `target` (path and query); None allows it."""
+        """Return the error response to a request for `target` (path and query); None to accept."""
         try:
             path = urlsplit(target).path
         except ValueError:
@@ -130,7 +130,7 @@ class Guard:
         return None
 
     def admission(self, target: str) -> str | None:
-        """Return the cookie to set if `target` contains the token, else None."""
+        """Return the cookie for a visitor whose `target` contains the token, else None."""
         if self.token is None or not self._matches(_tokens_in(target)):
             return None
         # Strict cookies are not sent after a link on another site. Only web sockets can command,
@@ -181,7 +181,7 @@ def guarded_serve(
 
     Args:
         guard: Accepts or rejects requests.
-        attendance: Records input and departure of the visitor in control.
+        attendance: Records when the visitor in control sends input or disconnects.
         is_read_only: Whether visitors can only watch.
     """
 
@@ -217,7 +217,7 @@ def guarded_serve(
 
 
 def _adapt(response: Response, is_read_only: bool) -> None:
-    """Add language and viewport to the page; in read-only mode, name its role Watching."""
+    """Add language and viewport to the page; in read-only mode, show the role `Watching`."""
     content = response.headers.get('Content-Type', '')
     body = bytes(response.body or b'')
     if content.startswith('text/html'):
@@ -229,10 +229,7 @@ def _adapt(response: Response, is_read_only: bool) -> None:
 
 
 def _attended(handler: Any, attendance: Attendance) -> Callable[[Any], Awaitable[None]]:
-    """Wrap a handler of web sockets so that it records input and departure.
-
-    It waits only briefly for a browser that does not confirm the end of the connection.
-    """
+    """Wrap a handler of web sockets so that `attendance` records input and disconnection."""
 
     async def handle(connection: Any) -> None:
         # A browser that hangs does not confirm the end, and the next visitor would wait for it.

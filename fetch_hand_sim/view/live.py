@@ -1,4 +1,4 @@
-"""Follow a running robot for the page, and pass on the requests of the page."""
+"""Follow a running robot for the page, and send it the requests of the page."""
 
 from __future__ import annotations
 
@@ -51,11 +51,11 @@ _NOTICE_TIME = 3.0
 
 
 class LiveRobot:
-    """Follows the robot in the node's namespace and passes on the requests of the page.
+    """Follows the robot in the namespace of `node` and sends it the requests of the page.
 
     Args:
         node: The node of this process.
-        may_command: Whether the page may act.
+        may_command: Whether the page may act, not only watch.
     """
 
     def __init__(self, node: Node, may_command: bool) -> None:
@@ -89,13 +89,13 @@ class LiveRobot:
 
     @property
     def picture_period(self) -> float:
-        """Seconds between two pictures of this robot."""
+        """Seconds between two pictures; longer if the robot is faster than real time."""
         status = self._watch.status
         is_fast = status is not None and self._facts.rate > _HURRY * status.control_hz
         return OVERLOOKING if is_fast else FOLLOWING
 
     def picture(self) -> Picture | None:
-        """Return what to show if it has changed since the last call."""
+        """Return the new picture, or None if nothing has changed since the last call."""
         if not self._is_new or self._history is None:
             return None
         self._is_new = False
@@ -140,7 +140,7 @@ class LiveRobot:
             self._update_facts(notice=notice)
 
     def _notice_other_robot(self) -> None:
-        """If the robot has shut down or restarted, end commands and goals meant for it."""
+        """Stop commanding and drop the user's goal if the robot has shut down or restarted."""
         publishers = status_publishers(self._node)
         if publishers != self._publishers:
             self._publishers = publishers
@@ -168,7 +168,10 @@ class LiveRobot:
         self._update_facts(phase=status.phase, episode=status.episode, seed=status.seed)
 
     def _history_for(self, spec: TaskSpec, status: EpisodeStatus) -> History:
-        """Return the history of this robot, or a new one if the robot or its rule is another."""
+        """Return the history for a status; a new one if the task differs or the robot waits.
+
+        Another success rule begins new curves.
+        """
         known, rule = self._history, status.success_rule
         # A waiting robot has no episode yet.
         if known is None or known.spec.name != spec.name or status.phase == 'waiting':
@@ -207,7 +210,7 @@ class LiveRobot:
             self._update_facts(is_silent=False)
 
     def _look(self) -> None:
-        """Check the ROS graph for another robot or a replay, and read changed settings."""
+        """Check the ROS graph for another robot or a replay; request settings that may be new."""
         self._notice_other_robot()
         is_other = self._replays.look()
         replay = self._replays.replay
@@ -230,14 +233,14 @@ class LiveRobot:
             self._requests.read_actor()
 
     def _end_notice(self) -> None:
-        """Remove the notice on the page once its episode is over and it was shown for a while."""
+        """Remove the notice on the page after its episode, but not before it was shown for 3 s."""
         episode, since = self._noticed
         is_over = episode != (self._facts.episode, self._facts.seed)
         if self._facts.notice and is_over and time.monotonic() - since > _NOTICE_TIME:
             self._update_facts(notice='')
 
     def _follow_replay(self, name: str) -> None:
-        """Set the facts of a replay node `name`, which publishes no diagnostics as a robot does."""
+        """Set the facts for the replay node `name`, which publishes no diagnostics."""
         self._hear()
         self._asked_rate = None
         self._unread.add('speed')
@@ -274,7 +277,7 @@ class LiveRobot:
         self._yield_to_others()
 
     def _yield_to_others(self) -> None:
-        """Stop the commands of the page if another node commands."""
+        """Stop the commands of the page if another node commands the robot."""
         own = self._node.get_fully_qualified_name()
         others = [each for each in self._facts.commander.split(', ') if each != own]
         if others not in ([], ['-']):

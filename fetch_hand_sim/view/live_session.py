@@ -1,4 +1,4 @@
-"""Show a running robot on a page; start one with its policy if a task is given."""
+"""Show a running robot on a page; with `--task`, start a robot and a policy if none runs."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ _CLOCK = '/clock'
 
 
 def run_live(options: argparse.Namespace) -> int:
-    """Run until the user ends it; return the exit code."""
+    """Show a robot until the user ends the program; return the exit code."""
     return run_node(NODE_NAME, lambda stop: _run(options, stop), options.ros_arguments)
 
 
@@ -81,7 +81,7 @@ def _run(options: argparse.Namespace, stop: StopSignals) -> None:
 def attended(robot: LiveRobot, attendance: Attendance) -> Perform:
     """Return a function that passes requests to a robot only while the page is in use.
 
-    An unused page is still drawn, and would repeat the request of a held button.
+    An unused page is still drawn, so a button that was held would repeat its request.
     """
 
     def perform(request: Request) -> None:
@@ -99,7 +99,7 @@ def _nodes(
     loop: EventLoop,
     stop: StopSignals,
 ) -> Iterator[Nodes]:
-    """Find a robot, or start one with its policy and stop both afterwards."""
+    """Wait for a robot, or start one with a policy; yield the started nodes and stop them later."""
     end = time.monotonic() + (DISCOVERY_TIME if options.task else options.wait)
     while robot.spec is None and not stop and time.monotonic() < end:
         loop.wait(_FRAME_TIME)
@@ -122,7 +122,7 @@ def _nodes(
 
 
 def _check_is_wanted(options: argparse.Namespace, spec: TaskSpec, where: str) -> None:
-    """Check that the running robot fits the options; `where` is its namespace, for errors.
+    """Check that the running robot fits the options; `where` is its namespace.
 
     Raises:
         NodeFailure: If the robot has another task than `options.task`.
@@ -138,7 +138,7 @@ def _check_is_wanted(options: argparse.Namespace, spec: TaskSpec, where: str) ->
 
 
 def _no_robot(node: Node) -> str:
-    """Return the error for a namespace without a robot."""
+    """Return the error message for a namespace without a robot, with hints."""
     suffix = '/episode_status'
     topics = (name for name, _ in node.get_topic_names_and_types() if name.endswith(suffix))
     found = sorted(
@@ -172,7 +172,7 @@ def _start(options: argparse.Namespace, node: Node, log: IO[str]) -> Nodes:
 
 
 def check_alive(nodes: Nodes, log: IO[str]) -> None:
-    """Raise NodeFailure with name and cause if a node has ended."""
+    """Raise NodeFailure if a started node has ended; the error shows its last output."""
     for name, process in nodes.items():
         code = process.poll()
         if code is not None:

@@ -1,6 +1,6 @@
-"""Messages to the page from its source (a running robot or a file player): one tick each.
+"""Messages from the source (a running robot or a file player) to the page.
 
-A newer snapshot replaces an older one; every event arrives (`mujoco.studio.messages`).
+The viewer delivers every event, but only the newest snapshot (`mujoco.studio.messages`).
 """
 
 from __future__ import annotations
@@ -20,22 +20,23 @@ class Facts:
     """State of robot and episode that the page shows as text.
 
     Attributes:
-        source: `live` or `file`.
+        source: `live` for a running robot, `file` for an episode file.
+        phase: Phase of the episode: `waiting`, `reset`, `running` or `finished`.
         tick: Steps of the episode so far.
         ticks: Steps of a whole episode.
-        commander: Names of the nodes that command.
+        commander: Names of the nodes that command the robot.
         speed: Requested simulated seconds per second; 0 means as fast as possible.
-        has_speed: Whether the speed can be chosen; not in lockstep.
+        has_speed: Whether the speed can be chosen, which is not possible in lockstep.
         rate: Measured ticks per second; 0 if unknown.
-        missed_ticks: Since the robot started.
+        missed_ticks: Number of missed ticks since the robot started.
         push_limit: Largest force of a push, N; 0 if the robot accepts none.
         may_command: Whether this page can act at all.
         actors: Actors to choose from; empty without a policy node.
         actor: Name or file of the active actor, or '' if unknown.
         is_replay: Whether a replay node publishes instead of a robot.
-        is_silent: Whether the robot publishes nothing any more; the other facts are its last ones.
-        is_commanding: Whether the sliders of the page command.
-        notice: Result of the last action.
+        is_silent: Whether the robot has stopped publishing; then other facts are the last known.
+        is_commanding: Whether the sliders of the page command the robot.
+        notice: Line about the result of the last action, or ''.
     """
 
     source: str = 'live'
@@ -62,7 +63,7 @@ class Facts:
 
     @property
     def takes_actions(self) -> bool:
-        """True if this page can move goals and robot."""
+        """True if the user of this page can set goals and push the robot."""
         return self.source == 'live' and self.may_command and not self.is_replay
 
 
@@ -76,14 +77,14 @@ class Series:
 
 @dataclass(frozen=True, slots=True)
 class Graphs:
-    """The curves of the page; None if the task does not have them.
+    """The curves of the page; None where the task has no such curve.
 
     Attributes:
-        distance: To the goal, m.
-        rotation: To the goal, rad, 0 ... pi.
-        commands: Values (ticks, commands).
-        positions: Values (ticks, commands) of the joints that the commands drive. A gripper is -1
-            (closed) to 1 (open); the axes of its path are NaN.
+        distance: Distance to the goal, m.
+        rotation: Rotation to the goal, rad, 0 ... pi.
+        commands: Values (ticks, action size), command units.
+        positions: Values (ticks, action size) of the joints that the commands drive. The gripper is
+            -1 (closed) to 1 (open). Commands that move the gripper along an axis have NaN.
     """
 
     distance: Series | None = None
@@ -95,13 +96,13 @@ class Graphs:
 
 @dataclass(frozen=True, slots=True)
 class Timeline:
-    """Position of the playhead in a file, and of the file in its list.
+    """Position of the playhead in an episode, and of the episode in the list.
 
     Attributes:
-        time: Seconds since the first frame.
+        time: Simulated seconds since the first frame.
         title: Name of the episode.
-        number: Position in the list, from 0.
-        count: Length of the list.
+        number: Position of the episode in the list, from 0.
+        count: Number of episodes in the list.
     """
 
     time: float
@@ -112,15 +113,15 @@ class Timeline:
 
 @dataclass(frozen=True, eq=False)
 class Picture(messages.Snapshot):
-    """Everything that the page shows of one tick.
+    """Message with everything that the page shows of one tick.
 
     Attributes:
         task: Name of the task.
-        frame: Robot, object and goals; None before the first tick.
+        frame: State of robot, object and goals; None before the first tick.
         stamp_ns: Simulated time of the frame, nanoseconds.
         trail: Earlier positions (3,) of the object or gripper.
-        command: The last applied command.
-        timeline: Only for a file.
+        command: The last applied command (action size,); None at a reset.
+        timeline: Position in the file; None for a running robot.
     """
 
     task: str
@@ -135,6 +136,6 @@ class Picture(messages.Snapshot):
 
 @dataclass(frozen=True, eq=False)
 class ShowScene(messages.Event):
-    """Message: the page loads the model of another task."""
+    """Message with the scene of another task, which the page shows from then on."""
 
     scene: Scene

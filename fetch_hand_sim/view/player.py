@@ -35,7 +35,7 @@ _FRAME_TIME = 1.0 / 60.0
 
 
 def run_files(options: argparse.Namespace) -> int:
-    """Play files until the user ends it; return the exit code.
+    """Play files until the user ends the program; return the exit code.
 
     Raises:
         UsageError: If no episode can be played.
@@ -60,12 +60,12 @@ def run_files(options: argparse.Namespace) -> int:
 
 
 class Player:
-    """Moves a playhead over the frames of one episode of a list.
+    """Plays one episode of a list: moves a playhead over its frames.
 
     Args:
         paths: Episodes, at least one.
         clock: A steady clock, seconds.
-        may_act: Whether the page may pause, seek and choose.
+        may_act: Whether the page may pause, seek and open other episodes.
 
     Raises:
         EpisodeReadError: If no episode can be read.
@@ -97,7 +97,7 @@ class Player:
         return min(max(last, 0), len(times) - 1)
 
     def picture(self) -> Picture | None:
-        """Move the playhead; return what to show if it has changed."""
+        """Move the playhead; return the new picture, or None if nothing has changed."""
         self._advance()
         now = (self._number, self.index, self._is_paused, self._speed, self._notice)
         if now == self._shown:
@@ -137,14 +137,14 @@ class Player:
         self._position = float(self._recording.times[min(max(index, 0), last)])
 
     def _change(self, numbers: Sequence[int]) -> None:
-        """Open the first readable episode of these; without one, stay and show a notice."""
+        """Open the first readable episode of `numbers`; if all are unreadable, show a notice."""
         try:
             self._open_first(numbers)
         except EpisodeReadError as error:
             self._notice = str(error)
 
     def _open_first(self, numbers: Sequence[int]) -> None:
-        """Open the first readable episode of these, or raise EpisodeReadError."""
+        """Open the first readable episode of `numbers`; EpisodeReadError if all are unreadable."""
         skipped: list[EpisodeReadError] = []
         for number in numbers:
             try:

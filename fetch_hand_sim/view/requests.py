@@ -1,6 +1,6 @@
-"""Messages from the page to its source (a running robot or a file player): user requests.
+"""User requests, which the page sends to its source (a running robot or a file player).
 
-A newer snapshot replaces an older one; every event arrives (`mujoco.studio.messages`).
+The viewer delivers every event, but only the newest snapshot (`mujoco.studio.messages`).
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ class Request(messages.Message):
 
 @dataclass(frozen=True)
 class SetPaused(Request, messages.Event):
-    """Pauses or resumes."""
+    """Pauses or resumes the robot or the playback."""
 
     is_paused: bool
 
@@ -32,7 +32,7 @@ class StepOnce(Request, messages.Event):
 
 @dataclass(frozen=True)
 class Reset(Request, messages.Event):
-    """Ends the episode; the next one uses `seed`, or the next seed in order for None."""
+    """Ends the episode; the next one uses `seed`, or for None the next seed of the series."""
 
     seed: int | None = None
 
@@ -46,7 +46,7 @@ class SetSpeed(Request, messages.Event):
 
 @dataclass(frozen=True)
 class ChooseActor(Request, messages.Event):
-    """Makes the policy node load another actor."""
+    """Makes the policy node load another actor; `name` is a shipped actor, random or resting."""
 
     name: str
 
@@ -60,14 +60,14 @@ class SetCommanding(Request, messages.Event):
 
 @dataclass(frozen=True, eq=False)
 class SetCommand(Request, messages.Snapshot):
-    """The command (action size,) of the sliders, command units."""
+    """Sends the command (action size,) of the sliders, command units."""
 
     values: Array
 
 
 @dataclass(frozen=True, eq=False)
 class SetGoal(Request, messages.Snapshot):
-    """A new goal (goal size,), m and quaternion wxyz; `is_kept` repeats it in later episodes."""
+    """Sets a goal (goal size,), m and quaternion wxyz; `is_kept` repeats it in later episodes."""
 
     values: Array
     is_kept: bool = True
@@ -80,9 +80,9 @@ class ReleaseGoal(Request, messages.Event):
 
 @dataclass(frozen=True, eq=False)
 class Push(Request, messages.Snapshot):
-    """A wrench (6,) on a body, N and N m, world axes at the centre of mass, while it is sent.
+    """Pushes a body with a wrench (6,), N and N m, as long as the request is repeated.
 
-    A force above the robot's limit is reduced.
+    The wrench acts at the centre of mass, along the world axes. It is scaled down to the limit.
     """
 
     body: str
@@ -91,14 +91,14 @@ class Push(Request, messages.Snapshot):
 
 @dataclass(frozen=True)
 class Seek(Request, messages.Event):
-    """Shows a frame of a file."""
+    """Pauses the playback and shows the frame `index` of a file."""
 
     index: int
 
 
 @dataclass(frozen=True)
 class ChangeEpisode(Request, messages.Event):
-    """Opens another episode of the list, relative to this one."""
+    """Opens the episode that is `by` places further in the list, -1 for the one before."""
 
     by: int
 

@@ -1,4 +1,4 @@
-"""Pass requests of the page to a running robot, over public topics, services and parameters."""
+"""Send requests of the page to a running robot, over public topics, services and parameters."""
 
 from __future__ import annotations
 
@@ -44,11 +44,11 @@ _OF_A_REPLAY = (SetPaused, SetSpeed, SetCommanding)
 
 
 class RemoteNode:
-    """Calls services and sets parameters of another node without waiting for it.
+    """Calls services of another node without waiting for the responses.
 
     Args:
         node: The node of this process.
-        name: Name of the other node, relative to our namespace or fully qualified.
+        name: Name of the other node, fully qualified or relative to the namespace of `node`.
         notice: Called with one line about the result of a call.
     """
 
@@ -60,7 +60,7 @@ class RemoteNode:
         self._asked: dict[str, tuple[Any, float]] = {}
 
     def is_there(self) -> bool:
-        """Return whether the node offers its services."""
+        """Return whether the services of the other node are available."""
         return bool(self._client('set_parameters', _SET_PARAMETERS).service_is_ready())
 
     def call(
@@ -70,7 +70,7 @@ class RemoteNode:
         then: Callable[[], None] | None = None,
         **fields: Any,
     ) -> None:
-        """Call a service whose response has `success` and `message`, and `then` on success."""
+        """Call a service whose response has `success` and `message`; call `then` on success."""
 
         def answered(response: Any) -> None:
             self._notice(response.message)
@@ -80,7 +80,7 @@ class RemoteNode:
         self._call(service, type_name, fields, answered)
 
     def get_parameter(self, name: str, then: Callable[[Any], None]) -> None:
-        """Call `then` with the value of a parameter when the node answers, if it has one."""
+        """Request a parameter; call `then` with its value when the node answers."""
         from rclpy.parameter import parameter_value_to_python
 
         def answered(future: Any) -> None:
@@ -99,7 +99,7 @@ class RemoteNode:
     def set_parameter(
         self, name: str, value: str | int | float, then: Callable[[], None] | None = None
     ) -> None:
-        """Set a parameter, and call `then` if the node accepts it."""
+        """Set a parameter; call `then` if the node accepts the value."""
         from rclpy.parameter import Parameter
 
         def answered(response: Any) -> None:
@@ -122,10 +122,7 @@ class RemoteNode:
         self._asked.clear()
 
     def _awaits(self, name: str) -> bool:
-        """Return whether request `name` still waits for its answer, so that none is sent again.
-
-        After a few seconds without an answer it no longer waits.
-        """
+        """Return whether the request for parameter `name` is unanswered and less than 3 s old."""
         future, asked = self._asked.get(name, (None, 0.0))
         is_recent = time.monotonic() - asked < _ANSWER_TIMEOUT
         return future is not None and not future.done() and is_recent
@@ -152,11 +149,11 @@ class RemoteNode:
 
 
 class RobotRequests:
-    """Passes requests of the page to the nodes in our namespace.
+    """Sends requests of the page to the nodes in the namespace of `node`.
 
     Args:
         node: The node of this process.
-        tell: Called with changed fields of `Facts`, by name.
+        tell: Called with changed fields of `Facts` as keyword arguments.
     """
 
     def __init__(self, node: Node, tell: Callable[..., None]) -> None:
@@ -176,7 +173,7 @@ class RobotRequests:
         return self._policy.is_there()
 
     def take_task(self, spec: TaskSpec) -> None:
-        """Set the task of the robot; drop goal and command if they were for another task."""
+        """Set the task of the robot; if it differs, drop the user's goal and stop commanding."""
         if self._spec is not None and self._spec.name != spec.name:
             self.forget_goal()
             # Goals of another task may have another type.
@@ -186,11 +183,11 @@ class RobotRequests:
         self._spec = spec
 
     def forget_goal(self) -> None:
-        """Forget the goal that the page has set."""
+        """Drop the goal that the user has set."""
         self._kept_goal = self._asked_goal = None
 
     def take_replay(self, replay: Replay | None) -> None:
-        """Send requests to a replay node from now on, or to the robot for None."""
+        """Send requests to the node `replay` from now on; None sends them to the robot."""
         if self._replay is not None:
             self._replay[1].close()
         self._replay = None
@@ -198,23 +195,23 @@ class RobotRequests:
             self._replay = replay, RemoteNode(self._node, replay.name, self._notice)
 
     def begin_episode(self) -> None:
-        """Send the goal that the user keeps to the new episode."""
+        """Set the goal again in a new episode, if the user has chosen to keep it."""
         if self._kept_goal is not None and self._replay is None:
             self._send_goal(self._kept_goal)
 
     def read_speed(self) -> None:
-        """Ask for the requested speed; `tell` gets the answer."""
+        """Request the parameter with the speed; `tell` receives the answer as `speed`."""
         self._time.get_parameter(self._speed_name, lambda value: self._tell(speed=value))
 
     def read_actor(self) -> None:
-        """Ask for the active actor; `tell` gets the answer."""
+        """Request the parameter with the active actor; `tell` receives the answer as `actor`."""
         if self._spec is not None:
             # An empty parameter means the shipped actor of the task.
             shipped = self._spec.name
             self._policy.get_parameter('policy', lambda name: self._tell(actor=name or shipped))
 
     def perform(self, request: Request, facts: Facts) -> None:
-        """Perform a request to a robot in this state; requests about files are ignored."""
+        """Send a request to the robot, whose state is `facts`; ignore requests about files."""
         if self._spec is None or not self.fits(request):
             return
         if self._replay is not None and not isinstance(request, _OF_A_REPLAY):
@@ -267,10 +264,10 @@ class RobotRequests:
         return request.values.size == topic(self._spec, name).size
 
     def shown_goal(self, goal: Array) -> Array:
-        """Return the goal to draw, (goal size,): `goal`, which the robot publishes.
+        """Return the goal (goal size,) to draw; `goal` is the one that the robot publishes.
 
-        A goal that the page has sent is drawn instead until the robot publishes it, for a few
-        seconds at most.
+        After the page has sent a goal, that goal is drawn until the robot publishes it, at most for
+        0.5 s.
         """
         if self._asked_goal is not None:
             at, asked = self._asked_goal
@@ -281,7 +278,7 @@ class RobotRequests:
 
     @property
     def _time(self) -> RemoteNode:
-        """The node that controls pause, step and speed: the replay node if there is one."""
+        """The node that controls pause and speed: the replay node, or without one the robot."""
         return self._sim if self._replay is None else self._replay[1]
 
     @property
@@ -321,7 +318,7 @@ class RobotRequests:
         self._publishers[name].publish(data)
 
     def _withdraw(self, name: str) -> None:
-        """Destroy the publisher `name`: each publisher of commands counts as a commander."""
+        """Destroy the publisher of topic `name`; otherwise this node would count as a commander."""
         publisher = self._publishers.pop(name, None)
         if publisher is not None:
             self._node.destroy_publisher(publisher)

@@ -1,6 +1,6 @@
-"""Follow a robot, or a replay of one, over its topics; assemble each tick from its messages.
+"""Follow a robot or a replay over its topics; assemble each tick from its messages.
 
-Subscriptions are best effort, so the robot never sends a message again to a viewer that hangs.
+Subscriptions are best effort, so the robot need not resend messages to a viewer that hangs.
 """
 
 from __future__ import annotations
@@ -52,10 +52,10 @@ class SeenTick:
 
     Attributes:
         stamp_ns: Simulated time, nanoseconds.
-        frame: Robot, object and goals.
+        frame: State of robot, object and goals.
         reward: None at a reset.
         command: (action size,) applied command; None at a reset.
-        status: Status of the episode at this tick; None if it was not published together.
+        status: Status of the episode at this tick; None unless `latest_tick` contains it.
     """
 
     stamp_ns: int
@@ -66,14 +66,14 @@ class SeenTick:
 
 
 class RobotWatch:
-    """Subscribes to the robot in the node's namespace.
+    """Subscribes to the robot in the namespace of `node`.
 
     Args:
         node: The node of this process.
-        on_status: Called with each status, which may come from another robot than before.
+        on_status: Called with each status; another robot may have replaced the last one.
         on_tick: Called with each tick.
-        every_tick: Whether each tick is needed. If not, `latest_tick` is used if it exists;
-            replays do not publish it.
+        every_tick: Whether each tick is needed. If not, the topic `latest_tick` is used if it
+            exists; replays do not publish it.
 
     Attributes:
         status: The latest status; None before the first.
@@ -115,7 +115,7 @@ class RobotWatch:
         return self.status.joint_prefix if self.status else JOINT_PREFIX
 
     def _on_status_message(self, message: Any) -> None:
-        """Take a status from its own topic, unless `latest_tick` brings it."""
+        """Handle a message of `episode_status`, unless `latest_tick` contains the same status."""
         try:
             status = _read_status(message)
         except ValueError:
@@ -124,7 +124,7 @@ class RobotWatch:
             self._take_status(status)
 
     def _is_other(self, status: EpisodeStatus) -> bool:
-        """Return whether a status is from another robot than the last."""
+        """Return whether a status comes from another robot than the last status."""
         return self.status is None or not self.status.is_of_same_robot(status)
 
     def _take_status(self, status: EpisodeStatus) -> None:
@@ -231,7 +231,7 @@ class RobotWatch:
 
 
 def _read_status(message: Any) -> EpisodeStatus:
-    """Return the parsed `episode_status`; ValueError if the task is unknown here."""
+    """Parse an `episode_status` message; ValueError if it is invalid or its task is unknown."""
     status = EpisodeStatus.from_values(decode_status(message))
     _spec_of(status)
     return status
@@ -243,18 +243,18 @@ def _spec_of(status: EpisodeStatus) -> TaskSpec:
 
 @dataclass(frozen=True, slots=True)
 class Replay:
-    """The fully qualified names of a node that replays an episode and of its pause service."""
+    """A replay node: fully qualified names of the node and of its pause service."""
 
     name: str
     pause: str
 
 
 class ReplayWatch:
-    """Finds a replay in the graph and counts its ticks, because it publishes no diagnostics.
+    """Finds a replay node in the ROS graph and measures its rate.
 
     Attributes:
-        replay: The replay node; None without one, or if a robot runs too.
-        rate: Ticks per second in the last period.
+        replay: The replay node; None without one, or if a robot also runs.
+        rate: Measured ticks per second.
     """
 
     def __init__(self, node: Node) -> None:
@@ -267,12 +267,12 @@ class ReplayWatch:
         self._paused_looks = 0
 
     def count_tick(self) -> None:
-        """Count a tick."""
+        """Count a tick of the replay."""
         self._ticks += 1
         self._moved = True
 
     def look(self) -> bool:
-        """Read the ROS graph; return whether a replay node has come, gone or been replaced."""
+        """Read the ROS graph; return whether the replay node has started, stopped or changed."""
         found, before = _find_replay(self._node), self.replay
         self.replay = found
         now = time.monotonic()
@@ -286,10 +286,10 @@ class ReplayWatch:
         return found != before
 
     def stands_still(self, is_paused: bool) -> bool:
-        """Return whether a paused replay still publishes no ticks; another client may resume it.
+        """Return whether a replay is still paused; another client may have resumed it.
 
         Args:
-            is_paused: Whether it was paused at the last look.
+            is_paused: Whether the replay was paused at the last call.
         """
         moved, self._moved = self._moved, False
         self._paused_looks = self._paused_looks + 1 if is_paused else 0
@@ -297,7 +297,7 @@ class ReplayWatch:
 
 
 def status_publishers(node: Node) -> frozenset[bytes]:
-    """Return the identities of the publishers of `episode_status`; they change with the robot."""
+    """Return the ids of the publishers of `episode_status`; a restarted robot has another id."""
     return frozenset(bytes(info.endpoint_gid) for info in _publishers(node))
 
 
@@ -313,7 +313,7 @@ def _find_replay(node: Node) -> Replay | None:
 
 
 def _as_replay(node: Node, info: Any) -> Replay | None:
-    """Return the node of a publisher as a replay if it offers pause but not reset, else None."""
+    """Return a publisher's node if it is a replay (offers pause but not reset), else None."""
     name, namespace = info.node_name, info.node_namespace
     if not namespace.startswith('/'):
         # The publisher was discovered before its node.

@@ -1,4 +1,4 @@
-"""Connect a page with its source: send pictures to the viewer, and requests back."""
+"""Connect a page with its source, a running robot or a file player."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ _DROPPED = (
 
 
 class Requests(plugin.SimPlugin):
-    """Plugin of the viewer: calls `perform` with each request of the page.
+    """A viewer plugin that calls `perform` with each request of the page.
 
-    Perturbations of bodies become `Push` requests.
+    It converts forces of MuJoCo's mouse perturbation to `Push` requests.
     """
 
     def __init__(self, perform: Perform) -> None:
@@ -49,11 +49,11 @@ class Requests(plugin.SimPlugin):
 
 
 class Session:
-    """One open page and its source, a running robot or a file player.
+    """Sends pictures from the source to the page, and requests back.
 
     Args:
         handle: The viewer that shows the page.
-        picture: Returns what to show if it has changed since the last call.
+        picture: Returns the new picture, or None if nothing has changed.
     """
 
     def __init__(
@@ -64,10 +64,10 @@ class Session:
         self._scene: Scene | None = None
 
     def update(self) -> bool:
-        """Show what is new and pass on requests; return whether anything was new.
+        """Show a new picture, if any, and pass on requests; return whether there was one.
 
         Raises:
-            Exception: The error that ended the viewer's thread.
+            Exception: The error that ended the thread of the viewer.
         """
         self._handle.is_running()
         picture = self._picture()

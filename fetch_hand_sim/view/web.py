@@ -1,4 +1,4 @@
-"""Serve the page: MuJoCo's web viewer behind the guard, on a socket of our choice."""
+"""Serve the page with MuJoCo's web viewer, on a chosen interface and with access checks."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ _SET_TIMER_SLACK, _SLACK_NS = 29, 5_000_000
 
 @dataclass(frozen=True, slots=True)
 class Address:
-    """Address of the page; `token` is None if the page is local."""
+    """Address of the page; without a `token`, only this machine can connect."""
 
     host: str
     port: int
@@ -81,10 +81,7 @@ class Address:
 
 @dataclass(frozen=True, slots=True)
 class Touch:
-    """State of mouse and buttons in one frame.
-
-    The page is in use while a button is held or `mouse` changes from frame to frame.
-    """
+    """State of the user's input (mouse position, wheel, buttons, typing) in one frame."""
 
     mouse: tuple[float, float] = (0.0, 0.0)
     wheel: float = 0.0
@@ -95,11 +92,10 @@ class Touch:
 class FrameRate:
     """Decides when the next frame begins. Times are seconds of one steady clock.
 
-    Frames are rare while the page is untouched: on two processors, each frame costs a robot in
-    lockstep some ticks.
+    Without input, frames are rare, because drawing takes CPU time from the robot.
 
     Args:
-        period: Returns the seconds between two frames of an untouched page.
+        period: Returns the seconds between two frames while the page receives no input.
     """
 
     def __init__(self, period: Callable[[], float] = lambda: FOLLOWING) -> None:
@@ -109,7 +105,7 @@ class FrameRate:
         self._began = 0.0
 
     def wait_time(self, now: float, touch: Touch) -> float:
-        """Return the seconds until the next frame, which is assumed to begin then."""
+        """Return the seconds to wait before the next frame; call it once per frame."""
         is_held = touch.is_down or touch.is_typing or touch.wheel != 0.0
         if is_held or touch.mouse != self._touch.mouse:
             self._touched = now
@@ -139,7 +135,7 @@ class _Viewer(web_viewer.WebViewer):
         self._update_model()
 
     def get_drop_file(self) -> str:
-        """Return no file."""
+        """Return '', so that a file dropped on the page is ignored."""
         return ''
 
 
@@ -154,7 +150,7 @@ def _read_touch() -> Touch:
 
 
 def _outside_host() -> str:
-    """Return the address from which this machine sends, or its name without a network."""
+    """Return the network address of this machine, or its host name without a network."""
     for family, other in _OTHER_HOSTS:
         # `connect` of a datagram socket only chooses the route; it sends nothing.
         with suppress(OSError), socket.socket(family, socket.SOCK_DGRAM) as route:
@@ -173,15 +169,15 @@ def open_page(
     attendance: Attendance | None = None,
     is_read_only: bool = False,
 ) -> tuple[viewer_handle.ViewerHandle, Address]:
-    """Serve the page from a thread and check that the guard works; once per process.
+    """Serve the page from a thread and check that the guard works; call it once per process.
 
     Args:
         host: Interface to listen on.
         port: A port, or 0 for the first free one from 8080.
-        plugins: Plugins of the page and of the robot's side.
-        frame_rate: When to build frames.
-        attendance: Records whether a visitor is at the page in control.
-        is_read_only: Whether the page cannot act, for the warning.
+        plugins: Viewer plugins and simulation plugins of the page.
+        frame_rate: Decides when frames are drawn.
+        attendance: Records whether the page in control is in use.
+        is_read_only: Whether the page can only watch.
 
     Raises:
         CommandError: If the port is taken, or the host is no address of this machine.
@@ -211,7 +207,7 @@ def open_page(
 
 
 def _replace_server(listening: socket.socket, serve: Callable[..., Any]) -> None:
-    """Make the viewer use our socket and our guarded `serve`.
+    """Make MuJoCo's viewer use the socket `listening` and the function `serve`.
 
     MuJoCo 4.0 has no option for these: the viewer always binds all interfaces, calls
     `websockets.serve` itself and prints its own address.
@@ -224,7 +220,7 @@ def _replace_server(listening: socket.socket, serve: Callable[..., Any]) -> None
 
 
 def _wake_seldom() -> None:
-    """Allow timers of this thread and its children to be late, which saves processor time.
+    """Save CPU time: let timers of this thread and its children be up to 5 ms late.
 
     A thread of the viewer polls 2,000 times a second.
     """
@@ -233,7 +229,7 @@ def _wake_seldom() -> None:
 
 
 def is_no_farewell(record: logging.LogRecord) -> bool:
-    """Return False for log records of a closed connection, which would only fill the log."""
+    """Filter for log records; return False if the error is only a closed connection."""
     error = record.exc_info[1] if record.exc_info else None
     return not isinstance(error, ConnectionClosed)
 

@@ -1,7 +1,7 @@
-"""`visualization_node`: a robot for rviz2, Foxglove and other standard tools.
+"""`visualization_node`: publishes what rviz2, Foxglove and other tools need to show a robot.
 
-`transforms.py` computes the frames, `messages.py` the messages and pictures. `node.py` is
-the node, a process beside the robot.
+`transforms.py` computes frames, `messages.py` messages and pictures. `node.py` is the node, which
+runs in a process of its own.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Messages for standard tools: transforms, markers, numbers for plots, pictures of a camera."""
+"""Make messages for standard tools: transforms, markers, numbers for plots, camera images."""
 
 from __future__ import annotations
 
@@ -45,13 +45,13 @@ _JPEG_FORMAT = 'rgb8; jpeg compressed bgr8'
 
 
 def stamp(nanoseconds: int) -> Time:
-    """Return a time message."""
+    """Convert nanoseconds to a time message."""
     seconds, rest = divmod(nanoseconds, 10**9)
     return Time(sec=seconds, nanosec=rest)
 
 
 def transform_messages(transforms: Iterable[Transform], stamp_ns: int) -> list[TransformStamped]:
-    """Return the messages of transforms, with the same stamp."""
+    """Convert transforms to messages that all have the stamp `stamp_ns`."""
     time = stamp(stamp_ns)
     messages = []
     for each in transforms:
@@ -66,7 +66,7 @@ def transform_messages(transforms: Iterable[Transform], stamp_ns: int) -> list[T
 
 
 def marker_array(shapes: Mapping[str, Sequence[Shape]], stamp_ns: int) -> MarkerArray:
-    """Return shapes as markers, which replace those of earlier messages."""
+    """Convert shapes, grouped by marker namespace, to markers that replace all earlier ones."""
     header = Header(stamp=stamp(stamp_ns), frame_id=ROOT)
     first = Marker(header=header, action=Marker.DELETEALL)
     markers = [first]
@@ -84,7 +84,7 @@ def marker_array(shapes: Mapping[str, Sequence[Shape]], stamp_ns: int) -> Marker
 
 
 def image_message(picture: Picture, frame_id: str, stamp_ns: int) -> Image:
-    """Return a picture (height, width, 3), red first."""
+    """Convert an RGB picture (height, width, 3) to an uncompressed image message."""
     height, width = picture.shape[:2]
     message = Image(
         header=Header(stamp=stamp(stamp_ns), frame_id=frame_id),
@@ -98,7 +98,7 @@ def image_message(picture: Picture, frame_id: str, stamp_ns: int) -> Image:
 
 
 def compressed_message(picture: Picture, frame_id: str, stamp_ns: int) -> CompressedImage:
-    """Return a picture (height, width, 3), red first, as JPEG."""
+    """Convert an RGB picture (height, width, 3) to a JPEG image message."""
     file = BytesIO()
     PIL.Image.fromarray(picture).save(file, 'JPEG', quality=_JPEG_QUALITY)
     message = CompressedImage(
@@ -109,11 +109,11 @@ def compressed_message(picture: Picture, frame_id: str, stamp_ns: int) -> Compre
 
 
 def camera_info(width: int, height: int, fovy: float, frame_id: str, stamp_ns: int) -> CameraInfo:
-    """Return the calibration of a camera without distortion.
+    """Return the calibration message of a camera without distortion.
 
     Args:
-        width: Pixels.
-        height: Pixels.
+        width: Width of the picture, pixels.
+        height: Height of the picture, pixels.
         fovy: Vertical field of view, degrees.
         frame_id: Optical frame of the camera.
     """
@@ -137,7 +137,7 @@ def _quaternion(wxyz: Array) -> Quaternion:
 
 
 def _scale(shape: Shape) -> Vector3:
-    """Return full lengths; MuJoCo has radii and half lengths."""
+    """Return the full side lengths of a shape; MuJoCo stores radii and half lengths."""
     size = shape.size
     if shape.shape in _ROUND_RODS:
         size = np.array([size[0], size[0], size[1]])
@@ -146,14 +146,14 @@ def _scale(shape: Shape) -> Vector3:
 
 
 class Scalars:
-    """Encodes the topics `scalars/*` of one task."""
+    """Encodes the topics `scalars/*` of one task: distances to the goal, reward and success."""
 
     def __init__(self, spec: TaskSpec, success_rule: SuccessRule) -> None:
         self._metric = GoalMetric(spec, success_rule=success_rule)
         self._codecs = {source.name: TopicCodec(source) for source in scalar_topics(spec)}
 
     def messages(self, tick: SeenTick) -> dict[str, bytes]:
-        """Return the CDR bytes of each topic; a reset has no reward."""
+        """Return CDR bytes by topic; there is no reward at a reset."""
         frame = tick.frame
         distance, rotation = self._metric.distances(frame.achieved_goal, frame.desired_goal)
         numbers = {
@@ -171,7 +171,7 @@ class Scalars:
 
 
 class Camera:
-    """Pictures of one scene, `width` x `height` pixels, at most `hz` per second; 0 for none."""
+    """Draws pictures of a scene, `width` x `height` pixels, at most `hz` per second; 0 for none."""
 
     def __init__(self, width: int, height: int, hz: float, clock: Callable[[], float]) -> None:
         self.width, self.height = width, height
@@ -200,7 +200,7 @@ class Camera:
         return picture
 
     def problem(self) -> str:
-        """Return why pictures are fewer than requested, or ''."""
+        """Return a line if drawing is too slow for the requested rate, else ''."""
         seconds = self.picture_time.median()
         if seconds <= self._period:
             return ''

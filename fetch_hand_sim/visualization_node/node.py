@@ -1,4 +1,4 @@
-"""The ROS node: follows a robot and publishes its state for standard tools."""
+"""The ROS node that follows a robot and publishes its state for standard tools."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ _SERVED_FIRST = 200
 
 
 class VisualizationNode(Node):
-    """Publishes `msgs_spec.topics.view_topics`."""
+    """Publishes the topics `msgs_spec.topics.view_topics` for the robot in its namespace."""
 
     def __init__(self) -> None:
         super().__init__(NODE_NAME, start_parameter_services=False)
@@ -89,7 +89,7 @@ class VisualizationNode(Node):
         self.get_logger().info(f'waiting for a robot on {status_name}')
 
     def run(self, stop: StopSignals) -> None:
-        """Serve until a signal."""
+        """Follow the robot until a signal arrives."""
         loop = EventLoop(self)
         try:
             while not stop:
@@ -103,7 +103,7 @@ class VisualizationNode(Node):
             loop.close()
 
     def _open(self, source: TopicSpec) -> None:
-        """Open a topic unless its message type is missing; PyPI lacks tf2_msgs."""
+        """Open a topic; warn if its message package is not installed, as tf2_msgs without ROS."""
         try:
             self._outputs[source.name] = open_publisher(self, source)
         except ImportError:
@@ -128,7 +128,7 @@ class VisualizationNode(Node):
             self._scalars = Scalars(spec, status.success_rule)
 
     def _begin(self, spec: TaskSpec) -> None:
-        """Follow another robot."""
+        """Begin to follow a robot; publish its URDF and fixed transforms."""
         self._camera.close()
         self._latest = self._unmarked = self._undrawn = self._scalars = None
         try:
@@ -165,7 +165,7 @@ class VisualizationNode(Node):
             output.publish(output.msg_type(transforms=transform_messages(transforms, stamp_ns)))
 
     def _show_latest(self) -> None:
-        """Send markers and pictures, which need not come with every tick."""
+        """Publish markers and pictures of the newest tick; other ticks may be left out."""
         scene = self._scene
         if scene is None:
             return
@@ -198,7 +198,7 @@ class VisualizationNode(Node):
                 self._on_tick(self._latest)
 
     def _report_when_due(self) -> None:
-        """Report on the camera, once a second."""
+        """Publish diagnostics of the camera once a second."""
         now = time.monotonic()
         if now < self._report_due:
             return

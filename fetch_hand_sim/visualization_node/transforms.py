@@ -1,4 +1,4 @@
-"""Frames of a robot: links of its URDF, its object, its goal."""
+"""Compute the coordinate frames of a robot: links of its URDF, object and goal."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from msgs_spec.tasks import GoalKind, task_spec
 
 @dataclass(frozen=True, slots=True)
 class Transform:
-    """Pose of a frame in its parent."""
+    """Pose of the frame `child` in the frame `parent`."""
 
     parent: str
     child: str
@@ -34,12 +34,12 @@ class Transforms:
         self._index = {name: number for number, name in enumerate(self._spec.robot.joints)}
 
     def fixed(self) -> list[Transform]:
-        """Return the transforms that never change."""
+        """Return the transforms of fixed joints, which never change."""
         joints = (joint for joint in self.description.joints if joint.kind == 'fixed')
         return [self._between(joint.parent, joint.child, joint.pose()) for joint in joints]
 
     def moving(self, frame: Frame) -> list[Transform]:
-        """Return the transforms of one tick: joints, object, goal."""
+        """Return the transforms of one tick: moving links, object and goal."""
         found = [
             self._between(
                 joint.parent,
@@ -54,7 +54,7 @@ class Transforms:
         return [*found, *self._goal(frame.desired_goal)]
 
     def _position(self, joint: str, frame: Frame) -> float:
-        """Return the position of a joint; 0 if the robot does not publish it."""
+        """Return the position of a joint, rad or m; 0 if the robot does not publish it."""
         index = self._index.get(joint)
         return 0.0 if index is None else float(frame.joint_position[index])
 
@@ -81,7 +81,7 @@ def frame_prefix(namespace: str) -> str:
 
 
 def view_transform(view: View, name: str) -> Transform:
-    """Return the optical frame of a camera: z ahead, x to the right, y down."""
+    """Return the transform to the optical frame of a camera: z ahead, x right, y down."""
     azimuth, elevation = np.radians(view.azimuth), np.radians(view.elevation)
     level = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
     ahead = np.cos(elevation) * level + np.array([0.0, 0.0, np.sin(elevation)])

@@ -1,1 +1,1 @@
-"""The page that MuJoCo's viewer draws: panels, curves and the mouse over the scene."""
+"""The page that MuJoCo's viewer draws: scene, panels, curves and mouse actions."""

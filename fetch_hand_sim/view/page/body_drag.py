@@ -1,4 +1,4 @@
-"""Pull at a body with the mouse: MuJoCo's perturbation, a spring between body and mouse."""
+"""Pull a body with the mouse, by a spring between both (a perturbation of MuJoCo)."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _REACH = 0.1
 
 
 def can_be_pulled(model: mujoco.MjModel, body: int) -> bool:
-    """Return whether a body can move, has a name, and is neither world nor ghost."""
+    """Return whether a body can move, has a name, and is not the ghost that shows a goal."""
     if body <= 0 or model.body(body).name in ('', GHOST):
         return False
     while body:
@@ -31,9 +31,9 @@ def can_be_pulled(model: mujoco.MjModel, body: int) -> bool:
 
 
 def pulls(model: mujoco.MjModel, snapshot: messages.PerturbSnapshot) -> list[tuple[str, Array]]:
-    """Return the pulled bodies of a snapshot with their wrenches (6,) in N and N m.
+    """Return name and wrench (6,), N and N m, of each pulled body in a snapshot of forces.
 
-    Wrenches are along the world axes, at the centre of mass. A snapshot of another model has none.
+    Wrenches act at the centre of mass, along the world axes. A snapshot of another model has none.
     """
     size = mujoco.mj_stateSize(model, _FORCES)
     if snapshot.state_sig != _FORCES or snapshot.state.shape != (size,):
@@ -48,7 +48,7 @@ def pulls(model: mujoco.MjModel, snapshot: messages.PerturbSnapshot) -> list[tup
 
 
 class BodyDrag:
-    """A spring between the mouse and a body: it sets MuJoCo's perturbation, which is drawn."""
+    """A spring between the mouse and a body; the viewer draws it as a perturbation of MuJoCo."""
 
     def __init__(self, viewer: viewer_protocol.Viewer) -> None:
         self._viewer = viewer
@@ -59,9 +59,9 @@ class BodyDrag:
         return bool(self._viewer.perturb.active)
 
     def begin(self, ray: Ray, limit: float) -> bool:
-        """Grab the body under the mouse with a force of at most `limit`, N.
+        """Grab the body under the mouse; return False if no body there can be pulled.
 
-        Returns False if no body there can move.
+        The force is at most `limit`, N.
         """
         viewer, perturb = self._viewer, self._viewer.perturb
         model, data = viewer.model, viewer.data
@@ -78,7 +78,7 @@ class BodyDrag:
         return True
 
     def move(self, delta: Sequence[float]) -> messages.PerturbSnapshot:
-        """Follow the mouse and return the forces, which are also written into `data` to draw them.
+        """Follow the mouse and return the forces on all bodies; the viewer draws them, too.
 
         `delta` (2,) is the movement since the last call, in widths and heights of the picture.
         """
@@ -100,7 +100,7 @@ class BodyDrag:
 def _body_under(
     model: mujoco.MjModel, data: mujoco.MjData, options: mujoco.MjvOption, ray: Ray
 ) -> tuple[int, Array]:
-    """Return the first body on a ray except the ghost, or -1, and the point of contact."""
+    """Return the first body on a ray, without the ghost, and the point (3,) hit; -1 for none."""
     ghost = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY.value, GHOST)
     geom = np.full((1, 1), -1, dtype=np.int32)
     distance = mujoco.mj_ray(

@@ -19,20 +19,20 @@ _MOVES = 'x '
 
 
 def is_move(part: CommandPart) -> bool:
-    """Return whether a command is relative: a distance in each tick, 0 at rest."""
+    """Return whether a command is a distance to move in each tick, not a target position."""
     return part.unit.startswith(_MOVES)
 
 
 class Teleoperation:
-    """A command that sliders and keys change.
+    """The command that the sliders and arrow keys of the page change.
 
     Args:
         robot: The robot.
         start: (action size,) the last command; None for the resting one.
 
     Attributes:
-        values: (action size,) command units.
-        selected: Index of the part that the keys change.
+        values: (action size,) the command, command units.
+        selected: Index of the value that the keys change.
     """
 
     def __init__(self, robot: RobotSpec, start: Array | None) -> None:
@@ -45,18 +45,18 @@ class Teleoperation:
         self._held: int | None = None
 
     def select(self, by: int) -> None:
-        """Select the part `by` places further in the command, cyclically."""
+        """Move the selection by `by` values; after the last value comes the first."""
         self.selected = (self.selected + by) % len(self._parts)
 
     def hold(self, direction: int, seconds: float) -> None:
-        """Apply a held key; call it in every frame, also without a key.
+        """Change the selected value by an arrow key; call it in every frame, also without a key.
 
-        Absolute commands change slowly and stay; relative ones are at their limit while a key is
-        held, and 0 after it.
+        A key moves a target position slowly. It sets a distance per tick (see `is_move`) to its
+        limit while held, and to 0 when released.
 
         Args:
-            direction: -1, 0 (no key) or 1.
-            seconds: Since the last call.
+            direction: -1 or 1 while a key is held, 0 without a key.
+            seconds: Seconds since the last call.
         """
         if self._held is not None and (not direction or self._held != self.selected):
             self.values[self._held] = 0.0
@@ -74,7 +74,7 @@ class Teleoperation:
 
 
 class CommandPanel:
-    """The part of the robot's panel that commands while no other node does."""
+    """The part of the robot panel with which the user commands the robot."""
 
     def __init__(self, send: Send) -> None:
         self._send = send
@@ -82,7 +82,7 @@ class CommandPanel:
         self._teleoperation: Teleoperation | None = None
 
     def draw(self, spec: TaskSpec, picture: Picture) -> None:
-        """Draw the panel, and send a command in every frame while it is switched on."""
+        """Draw the panel, and send a command in every frame while the user has switched it on."""
         facts = picture.facts
         if self._task != spec.name or not facts.is_commanding:
             self._task, self._teleoperation = spec.name, None

@@ -1,4 +1,4 @@
-"""Drag a goal with the mouse: points move, ghosts turn."""
+"""Drag a goal with the mouse: move points, turn or move poses."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def handles(spec: TaskSpec, goal: Array) -> list[Handle]:
 
 
 def find_handle(spec: TaskSpec, goal: Array, ray: Ray) -> Handle | None:
-    """Return the handle nearest to the mouse, or None if the mouse is at none."""
+    """Return the handle nearest to the mouse, or None if it is too far away to grab."""
     nearest = min(handles(spec, goal), key=lambda each: ray.distance_to(each.position))
     return nearest if ray.distance_to(nearest.position) < _REACH[spec.goal] else None
 
@@ -48,11 +48,11 @@ def moved_goal(
 
     Args:
         spec: The task.
-        goal: (goal size,) when the mouse grabbed it.
+        goal: (goal size,) the goal when the mouse grabbed it.
         handle: The grabbed point.
-        ray: The ray under the mouse now.
-        is_turning: Whether a pose turns instead of moving.
-        delta: (2,) movement of the mouse, in widths and heights of the picture.
+        ray: The present ray under the mouse.
+        is_turning: Whether to turn a pose instead of moving it.
+        delta: (2,) movement of the mouse since the grab, in widths and heights of the picture.
     """
     if spec.goal is GoalKind.POSE and (is_turning or not spec.position_counts):
         return _turned(spec, goal, ray, delta)
@@ -78,7 +78,7 @@ def _turned(spec: TaskSpec, goal: Array, ray: Ray, delta: Array) -> Array:
 
 
 def drag_hint(spec: TaskSpec) -> str:
-    """Return the effect of dragging a goal, as an instruction."""
+    """Return the hint that explains how to drag the goal of a task."""
     if spec.goal is not GoalKind.POSE:
         return 'Drag the goal'
     if not spec.position_counts:

@@ -1,4 +1,4 @@
-"""Set a goal with sliders."""
+"""Draw sliders with which the user sets a goal."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ def position_ranges(spec: TaskSpec) -> tuple[tuple[float, float], ...]:
 
 
 class GoalPanel:
-    """The part of the robot's panel that sets the goal.
+    """The part of the robot panel with which the user sets the goal.
 
     Attributes:
-        keeps_goal: True if later episodes repeat the goal set here.
+        keeps_goal: Whether later episodes use the goal set here, too.
     """
 
     def __init__(self, send: Send) -> None:
@@ -43,7 +43,7 @@ class GoalPanel:
         self.keeps_goal = True
 
     def draw(self, spec: TaskSpec, goal: Array) -> None:
-        """Draw the sliders of a goal (goal size,), and send another goal if one was moved."""
+        """Draw sliders for a goal (goal size,), and send the new goal if the user moves one."""
         self.keeps_goal = imgui.Checkbox('Keep my goal in new episodes', self.keeps_goal)[1]
         changed = goal.copy()
         if spec.goal is GoalKind.FINGERTIPS:
@@ -61,7 +61,7 @@ class GoalPanel:
 
 
 def _draw_position(spec: TaskSpec, position: Array) -> None:
-    """Draw sliders that change a position (3,), metres."""
+    """Draw sliders for a position (3,), metres, and write the new values into it."""
     for axis, (lower, upper) in enumerate(position_ranges(spec)):
         imgui.SetNextItemWidth(ITEM_WIDTH)
         name, value = f'{"xyz"[axis]} (m)', float(position[axis])

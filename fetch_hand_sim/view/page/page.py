@@ -1,4 +1,4 @@
-"""The page as a plugin of MuJoCo's viewer: scene, panels and mouse."""
+"""The viewer plugin that draws the page and handles the mouse."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from msgs_spec.arrays import Array
 
 @dataclasses.dataclass(slots=True)
 class _GoalDrag:
-    """State of a drag: the grabbed goal and where it was when the mouse grabbed it."""
+    """State of a drag: the grabbed point, and goal and mouse position when it was grabbed."""
 
     handle: Handle
     goal: Array
@@ -49,19 +49,19 @@ class Page(plugin.ViewerPlugin):
 
     @messages.handler
     def on_viewer_init(self, event: plugin.ViewerInitEvent) -> None:
-        """Set theme and rendering options."""
+        """Set theme and rendering options of the viewer."""
         ux.setup_theme(ux.GuiTheme.LIGHT)
         event.viewer.vis_options = make_options()
         self._body_drag = BodyDrag(event.viewer)
 
     @messages.handler
     def on_scene(self, event: ShowScene) -> None:
-        """Prepare for another robot; its model arrives in the next `PostModelEvent`."""
+        """Store the scene of another task; its model is loaded before the next `PostModelEvent`."""
         self._scene, self._picture, self._goal_drag = event.scene, None, None
 
     @messages.handler
     def on_post_model(self, event: messages.PostModelEvent) -> None:
-        """Set the camera of the task."""
+        """Point the camera at the scene of the new model."""
         del event
         if self._body_drag is not None:
             self._body_drag.end()

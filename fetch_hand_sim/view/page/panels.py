@@ -35,14 +35,14 @@ _TWO_COLUMNS = 2.0 * WIDTH + 3.0 * MARGIN
 
 
 class Panels:
-    """All panels, and what the user has entered in them.
+    """Draws all panels and stores the user's input.
 
     Args:
         send: Called with each request of the user.
         episodes: Episode files to choose from.
 
     Attributes:
-        goal_panel: Sets the goal.
+        goal_panel: The panel that sets the goal.
     """
 
     def __init__(self, send: Send, episodes: tuple[Path, ...] = ()) -> None:
@@ -55,7 +55,7 @@ class Panels:
         self._below = 0.0
 
     def draw(self, picture: Picture | None) -> None:
-        """Draw everything for one frame."""
+        """Draw all panels for one frame; None shows that the page waits for a robot."""
         size = imgui.GetIO().DisplaySize
         if picture is None:
             x, y = (size.x - WIDTH) / 2.0, size.y / 2.0 - 40.0
@@ -72,7 +72,7 @@ class Panels:
             self._draw_file(picture.timeline, picture.facts)
 
     def _draw_curves(self, spec: TaskSpec, graphs: Graphs) -> None:
-        """Draw the curves on the right, or in the left column of a narrow page."""
+        """Draw the curves at the right edge, or below the robot panel on a narrow page."""
         width = imgui.GetIO().DisplaySize.x
         is_narrow = width < _TWO_COLUMNS
         x, y = width - WIDTH - MARGIN, MARGIN
@@ -99,7 +99,7 @@ class Panels:
 
 
 def _height(is_shown: bool) -> float:
-    """Return the height, pixels, of the current window, or of its button if it is hidden."""
+    """Return the height, pixels, of the current window, or of the button of a hidden one."""
     return float(imgui.GetWindowSize().y) if is_shown else _BUTTON_HEIGHT
 
 
@@ -133,7 +133,7 @@ class EpisodeList:
 
 
 def describe(path: Path) -> str:
-    """Return name and outcome of an episode; takes about 1 ms."""
+    """Return name and outcome of an episode as a line of the list; this takes about 1 ms."""
     name = path.name.removesuffix('.mcap')
     try:
         outcome = read_summary(path).outcome
@@ -145,7 +145,7 @@ def describe(path: Path) -> str:
 
 
 def draw_timeline(timeline: Timeline, facts: Facts, send: Send) -> None:
-    """Draw the playback controls of an episode file: buttons, speed, slider over all frames."""
+    """Draw the playback controls of an episode file: buttons, a choice of speed, and a slider."""
     imgui.BeginDisabled(not facts.may_command)
     if imgui.Button('<< Episode'):
         send(ChangeEpisode(-1))

@@ -20,7 +20,7 @@ _ROOM = 0.15
 
 
 def draw_plots(spec: TaskSpec, graphs: Graphs, width: float) -> None:
-    """Draw distances with their thresholds, the reward, and commands beside joints."""
+    """Draw one plot each for distance, rotation and reward, and for each command and its joint."""
     if graphs.distance is not None:
         curves = {'distance (m)': graphs.distance}
         _plot('##Distance', curves, width, threshold=spec.distance_threshold)
@@ -55,7 +55,7 @@ def command_curves(part: CommandPart, graphs: Graphs, index: int) -> dict[str, S
 def value_limits(
     curves: Iterable[Series], threshold: float | None, begin: float, end: float
 ) -> tuple[float, float]:
-    """Return the limits of an axis that shows curves and threshold from `begin` to `end`, s."""
+    """Return the limits of the vertical axis for curves and threshold in `begin` ... `end`, s."""
     parts = [each.values[(each.times >= begin) & (each.times <= end)] for each in curves]
     values = np.concatenate([*parts, [] if threshold is None else [threshold]])
     values = values[np.isfinite(values)]

@@ -28,14 +28,14 @@ class MousePlace:
 
 @dataclass(frozen=True, slots=True)
 class Ray:
-    """A half line, and the axes of its camera.
+    """A half line from the camera, and the axes of the camera, in world coordinates.
 
     Attributes:
-        origin: (3,) m.
-        direction: (3,) unit length.
-        forward: (3,) axis of the camera.
-        right: (3,) axis of the camera.
-        up: (3,) axis of the camera.
+        origin: (3,) start of the line, m.
+        direction: (3,) unit vector.
+        forward: (3,) unit vector, view direction of the camera.
+        right: (3,) unit vector to the right of the picture.
+        up: (3,) unit vector to the top of the picture.
     """
 
     origin: Array
@@ -45,7 +45,7 @@ class Ray:
     up: Array
 
     def distance_to(self, point: Array) -> float:
-        """Return the distance of a point (3,) from the line, metres; infinite behind the camera."""
+        """Return the distance of a point (3,) from the ray, m; infinity behind the camera."""
         offset = point - self.origin
         along = float(offset @ self.direction)
         if along <= 0.0:
@@ -53,7 +53,7 @@ class Ray:
         return float(np.linalg.norm(offset - along * self.direction))
 
     def meets_plane(self, point: Array, normal: Array) -> Array | None:
-        """Return the intersection (3,) with a plane, or None."""
+        """Return the intersection (3,) with the plane through `point`; None without one."""
         slope = float(self.direction @ normal)
         if abs(slope) < 1e-6:
             return None

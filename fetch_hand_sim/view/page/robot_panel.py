@@ -1,4 +1,4 @@
-"""The panel of the robot: its state as text, and the controls to act on it."""
+"""The robot panel: the state of the robot as text, and controls."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _INTRODUCTIONS = {
 
 
 def introduction(spec: TaskSpec) -> str:
-    """Return one line about the goal of a task."""
+    """Return a sentence that describes the task to the user."""
     text = _INTRODUCTIONS.get(spec.name)
     things = (word for word in ('Block', 'Egg', 'Pen') if f'HandManipulate{word}' in spec.name)
     if spec.formulas is None and (thing := next(things, '').lower()):
@@ -48,7 +48,7 @@ def introduction(spec: TaskSpec) -> str:
 
 
 class RobotPanel:
-    """The panel of a running robot, and what the user has entered in it."""
+    """Draws the state and the controls of a robot or of an episode file; stores the input."""
 
     def __init__(self, send: Send, goal_panel: GoalPanel) -> None:
         self._send = send
@@ -109,7 +109,7 @@ class RobotPanel:
 
 
 def draw_actors(facts: Facts, send: Send) -> None:
-    """Draw a choice of actors; an unknown actor is listed first."""
+    """Draw a choice of actors; the active one is listed first if it is not among the choices."""
     names, index = list(facts.actors), 0
     if facts.actor in names:
         index = names.index(facts.actor)
@@ -148,7 +148,7 @@ def _draw_state(spec: TaskSpec, picture: Picture) -> None:
 
 
 class PushPanel:
-    """A body, a force, and a button that pushes while it is held."""
+    """Controls that choose a body and a force, and a button that pushes while it is held."""
 
     def __init__(self, send: Send) -> None:
         self._send = send

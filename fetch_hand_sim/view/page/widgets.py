@@ -1,4 +1,4 @@
-"""Windows of the page, and the buttons that a running robot and a file share."""
+"""Windows, text and buttons that several panels use."""
 
 from __future__ import annotations
 
@@ -29,14 +29,16 @@ class Windows:
         self._has_folded = False
 
     def fold_once(self, *names: str) -> None:
-        """Hide these windows at the first call; later calls leave them as the user has set them."""
+        """Hide the named windows at the first call; later calls do nothing."""
         if not self._has_folded:
             self._has_folded = True
             self._hidden.update(names)
 
     @contextmanager
     def column(self, title: str, x: float, y: float, height: float = 0.0) -> Iterator[bool]:
-        """Draw a window of the usual width; yield False if a button replaces a hidden one.
+        """Draw a window of width `WIDTH`; yield whether to draw its content.
+
+        If the user has hidden the window, draw a button that shows it again.
 
         Args:
             title: Title, which may change; text after `###` identifies the window.
@@ -63,7 +65,7 @@ class Windows:
 
 @contextmanager
 def untitled_window(name: str, x: float, y: float, width: float, height: float) -> Iterator[bool]:
-    """Draw a window without title that cannot be hidden; yield whether it is visible."""
+    """Draw a window without title that cannot be hidden; yield whether to draw its content."""
     _place(x, y, width, height)
     flags = _flags() | int(imgui.WindowFlags.NoTitleBar) | int(imgui.WindowFlags.NoScrollbar)
     try:
@@ -73,19 +75,19 @@ def untitled_window(name: str, x: float, y: float, width: float, height: float) 
 
 
 def say(text: str) -> None:
-    """Draw text over several lines; ImGui cannot wrap the font of the browser."""
+    """Draw text, wrapped to lines of 46 characters; ImGui cannot wrap the browser's font."""
     for line in textwrap.wrap(text, _LETTERS):
         imgui.Text(line)
 
 
 def draw_pause(is_paused: bool, resume: str, send: Send) -> None:
-    """Draw a button that pauses, or resumes with the label `resume`."""
+    """Draw a button that pauses; while paused, it has the label `resume` and resumes."""
     if imgui.Button(resume if is_paused else 'Pause'):
         send(SetPaused(not is_paused))
 
 
 def draw_step(label: str, frames: int, send: Send) -> None:
-    """Draw a button that moves by `frames` ticks."""
+    """Draw a button that steps a robot, or moves the playhead of a file by `frames`."""
     if imgui.Button(label):
         send(StepOnce(frames))
 
