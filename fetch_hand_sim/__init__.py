@@ -1,4 +1,4 @@
-"""The robots: thirteen tasks on MuJoCo in one batched simulation, and its ROS node."""
+"""The simulated robots: thirteen tasks in a batched MuJoCo simulation, and its ROS nodes."""
 
 from node_runtime.signals import guard_loading
 

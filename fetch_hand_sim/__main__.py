@@ -23,12 +23,13 @@ _NAME = 'fetch_hand_sim'
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """One word of the command line.
+    """A subcommand, or a group of subcommands such as `episodes`.
 
     Attributes:
-        module: Its `main` is the command; it is imported when the command runs.
-        extras: Extras of this package that the module imports.
+        module: Module with the function `main` that runs the command; '' for a group.
+        extras: Optional dependencies (extras of this package) that the module needs.
         is_node: Whether the command takes ROS parameters instead of options.
+        commands: Subcommands of a group by name.
     """
 
     help: str
@@ -87,7 +88,7 @@ COMMANDS = {
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command that the first words name; return its exit code."""
+    """Run the subcommand that the first arguments name; return its exit code."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     command, path, rest = _split(given)
     if command is None or command.commands:
@@ -98,7 +99,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _explain(words: Sequence[str]) -> int:
-    """Print help, the version, a completion script or an error, and exit."""
+    """Print help, the version, a completion script or an error, as the arguments request."""
     try:
         make_parser().parse_args(words)
         return EXIT_USAGE
@@ -108,7 +109,7 @@ def _explain(words: Sequence[str]) -> int:
 
 
 def _split(words: Sequence[str]) -> tuple[Command | None, list[str], list[str]]:
-    """Return the command that the first words name, these words, and the words after them."""
+    """Split arguments into a subcommand (or None), the words that name it, and its arguments."""
     commands, command, path = COMMANDS, None, []
     for word in words:
         if word not in commands:
@@ -120,10 +121,10 @@ def _split(words: Sequence[str]) -> tuple[Command | None, list[str], list[str]]:
 
 
 def ros_arguments(words: Sequence[str]) -> list[str]:
-    """Expand short parameters of a node: `task:=FetchPush` becomes `--ros-args -p ...`.
+    """Expand short ROS parameters: `task:=FetchPush` becomes `--ros-args -p task:=FetchPush`.
 
-    Words like `__ns:=/left` become remappings. Other ROS arguments may follow the short
-    parameters, with `--ros-args` or without.
+    Words that begin with `__`, such as `__ns:=/left`, become remappings (`-r`). Other ROS arguments
+    may follow, with or without `--ros-args`.
     """
     short = list(itertools.takewhile(lambda word: not word.startswith('-'), words))
     rest = list(words[len(short) :])
@@ -134,7 +135,7 @@ def ros_arguments(words: Sequence[str]) -> list[str]:
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """Return the parser of the command names, for help, errors and completion."""
+    """Return a parser of the subcommand names; it only prints help, errors and completion."""
     parser = _Parser(prog=_NAME, description=__doc__)
     parser.add_argument('--version', action='version', version=f'{_NAME} {version(_NAME)}')
     shtab.add_argument_to(parser, help='print a script that completes commands in your shell')
@@ -143,7 +144,7 @@ def make_parser() -> argparse.ArgumentParser:
 
 
 class _Parser(CommandParser):
-    """A parser that suggests a command for an unknown one."""
+    """A parser that suggests a similar name for an unknown subcommand."""
 
     def error(self, message: str) -> NoReturn:
         """Print the error in one line and exit."""

@@ -1,7 +1,7 @@
-"""Import MuJoCo even if the OpenGL backend in `MUJOCO_GL` is missing.
+"""Import MuJoCo even if the OpenGL backend in the variable `MUJOCO_GL` is missing.
 
-`import mujoco` fails then, even in programs that never render. Programs that render get an error
-from `simulation.opengl` that names the packages to install.
+A plain `import mujoco` fails then, even in programs that never render. When a program renders,
+`simulation.opengl` raises an error that names the packages to install.
 """
 
 import os
@@ -10,10 +10,9 @@ from importlib import import_module
 
 
 def import_mujoco() -> None:
-    """Import MuJoCo even if its OpenGL backend `MUJOCO_GL` does not work.
+    """Import MuJoCo if `MUJOCO_GL` is set; import it without OpenGL if that backend fails.
 
-    A failed import is repeated without OpenGL, so that only rendering reports the backend. The
-    variable keeps its value. Nothing is imported if it is not set.
+    `MUJOCO_GL` keeps its value, so that rendering reports the broken backend later.
     """
     asked = os.environ.get('MUJOCO_GL', '')
     if not asked or 'mujoco' in sys.modules:

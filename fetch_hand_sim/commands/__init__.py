@@ -1,1 +1,1 @@
-"""Commands for episodes and the demo, and their node processes."""
+"""The commands `episodes ...` and `demo`, and the child processes in which nodes run."""

@@ -58,7 +58,12 @@ _COLUMNS = '{:>7}  {:>5}  {:>5}  {:>7}  {:<7}  {}'
 
 
 class Watcher:
-    """A subscriber that follows the progress of an episode."""
+    """A ROS node that follows the robot of the demo.
+
+    Attributes:
+        status: The last status of the robot; None before the first.
+        ticks: Ticks of the current episode so far.
+    """
 
     def __init__(self, spec: TaskSpec) -> None:
         import rclpy
@@ -74,7 +79,7 @@ class Watcher:
             subscribe(self._node, topic(spec, name), callback)
 
     def others(self) -> str:
-        """Name a process that would interact with the nodes of this demo, or return ''."""
+        """Name another process that would interact with the nodes of this demo; '' without one."""
         if count_publishers(self._node, 'episode_status'):
             return 'a robot'
         # Policies that wait for a robot read its status and report diagnostics.
@@ -94,11 +99,11 @@ class Watcher:
         return 'a publisher of commands' if is_commanded else ''
 
     def spin(self) -> None:
-        """Serve callbacks for 50 ms at most."""
+        """Wait at most 50 ms for a message and handle it."""
         self._executor.spin_once(timeout_sec=0.05)
 
     def show(self, progress: Progress, bar: TaskID) -> None:
-        """Update a progress bar of the current episode."""
+        """Update the progress bar of the current episode; do nothing before the first episode."""
         status = self.status
         if status is None or status.phase == 'waiting':
             return
@@ -111,7 +116,7 @@ class Watcher:
         )
 
     def close(self, exit_code: int) -> None:
-        """Destroy the node; if that fails, the process ends with `exit_code`."""
+        """Destroy the ROS node; if that fails, end this process with `exit_code`."""
         self._executor.remove_node(self._node)
         destroy(self._node, exit_code)
 
@@ -130,7 +135,7 @@ class Watcher:
 
 
 class Demo:
-    """Runs the two nodes until the episodes are done."""
+    """Runs a simulator node and a policy node until all episodes are logged."""
 
     def __init__(self, options: argparse.Namespace, console: Console) -> None:
         self._options = options
@@ -248,7 +253,7 @@ class Demo:
 
 
 def _require_to_be_alone(watcher: Watcher, stop: StopSignals) -> None:
-    """Raise CommandError if nodes of other processes would interact with those of this demo."""
+    """Raise CommandError if another process would interact with the nodes of this demo."""
     end = time.monotonic() + DISCOVERY_TIME
     while not stop and time.monotonic() < end:
         watcher.spin()

@@ -1,6 +1,7 @@
 """Simulate logged episodes again and compare every message bit for bit.
 
-Exit code 0: all are identical; 1: an episode differs; 2: bad usage, or a file cannot be checked.
+Exit code 0: all episodes are identical; 1: an episode differs; 2: bad usage, or a file cannot be
+checked.
 """
 
 from __future__ import annotations
@@ -52,7 +53,7 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _expand(paths: Sequence[Path]) -> tuple[list[Path], int]:
-    """Return the episodes in the paths, and the exit code for invalid paths."""
+    """Return all episodes in the paths, and the exit code: 0, or 2 if a path has no episode."""
     episodes: list[Path] = []
     code = EXIT_SUCCESS
     for path in paths:
@@ -69,7 +70,7 @@ def _expand(paths: Sequence[Path]) -> tuple[list[Path], int]:
 
 
 def _check(episodes: Sequence[Path], results: list[CheckResult], is_quiet: bool) -> int:
-    """Check episodes, append to `results`, and return the exit code."""
+    """Check episodes, append each result to `results`, and return the exit code."""
     code = EXIT_SUCCESS
     with progress('episodes', len(episodes)) as advance:
         for episode in episodes:

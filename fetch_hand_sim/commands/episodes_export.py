@@ -108,14 +108,17 @@ def _why_none(path: Path, filtered: int) -> str:
 
 
 def _counted(episodes: Sequence[EpisodeArrays]) -> str:
-    """Return the number of episodes, and of interrupted ones, which learners may not expect."""
+    """Return a text with the number of episodes and how many of them were interrupted."""
     interrupted = sum(not episode.is_complete for episode in episodes)
     told = f', {interrupted} of them interrupted,' if interrupted else ''
     return f'{len(episodes)} episodes{told}'
 
 
 def _add(path: Path, by_task: dict[str, list[EpisodeArrays]], options: argparse.Namespace) -> bool:
-    """Read an episode into `by_task` if it passes the filters; EpisodeReadError if unreadable."""
+    """Load an episode into `by_task`; return False if the filters reject it.
+
+    An episode that is unreadable or does not fit into the dataset raises EpisodeReadError.
+    """
     # Reading a summary is much faster than reading all messages.
     summary = read_summary(path)
     if not is_wanted(options, summary.metadata.get('task'), summary):
@@ -129,7 +132,7 @@ def _add(path: Path, by_task: dict[str, list[EpisodeArrays]], options: argparse.
 
 
 def _why_left_out(episode: EpisodeArrays, others: Sequence[EpisodeArrays], to: str) -> str:
-    """Return why a dataset of this kind cannot contain an episode, or ''."""
+    """Return why an episode cannot be in a dataset of format `to` with the others, or ''."""
     if to == 'parquet':
         return ''
     if len(episode) == 0:
@@ -138,7 +141,7 @@ def _why_left_out(episode: EpisodeArrays, others: Sequence[EpisodeArrays], to: s
 
 
 def _export(options: argparse.Namespace, by_task: ByTask, name: str) -> dict[str, str]:
-    """Write all datasets; return the location by task."""
+    """Write a dataset for each task; return its location, as text, by task."""
     if options.to == 'parquet':
         files = export_parquet(by_task, options.output)
         return {task: ', '.join(map(str, paths)) for task, paths in files.items()}

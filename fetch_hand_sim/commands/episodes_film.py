@@ -1,4 +1,4 @@
-"""Write a film or a picture of a logged episode, or of a grid of episodes; no display is needed.
+"""Write a film or a picture of a logged episode, or of several side by side, without a display.
 
 Unreadable episodes in a folder are skipped and named on stderr. Exit code 0: written; 1: drawing or
 writing failed; 2: bad usage, or no readable episode.

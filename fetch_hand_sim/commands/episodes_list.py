@@ -1,6 +1,6 @@
 """List the episodes in a folder as a table.
 
-Exit code 0: all were read; 1: an episode was skipped (stderr names it); 2: bad usage.
+Exit code 0: all episodes were read; 1: an episode was skipped (stderr names it); 2: bad usage.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ def _cells(episode: EpisodeSummary) -> list[str]:
 
 
 def _name(file: Path) -> str:
-    """Return the current name of an episode; its bag may have been renamed."""
+    """Return the name of an episode's bag directory, or the file name without a bag."""
     is_bag = (file.parent / 'metadata.yaml').is_file()
     return file.parent.name if is_bag else file.stem.removesuffix('_0')
 
@@ -94,7 +94,7 @@ def _known(number: int | float | None) -> str:
 
 
 def _shown(cell: str) -> str:
-    """Return printable text of at most `_LONGEST_CELL` characters."""
+    """Make a text printable and shorten it to `_LONGEST_CELL` characters."""
     text = printable(cell)
     return text if len(text) <= _LONGEST_CELL else f'{text[: _LONGEST_CELL - 3]}...'
 
@@ -145,7 +145,7 @@ def _print_table(episodes: Sequence[EpisodeSummary]) -> None:
 
 
 def _as_json(episode: EpisodeSummary) -> dict[str, Any]:
-    """Return the row of an episode as JSON values, None for missing ones."""
+    """Return the columns of an episode as JSON values; missing values are None."""
     metadata, outcome = episode.metadata, episode.outcome
     return {
         'path': str(episode.path),

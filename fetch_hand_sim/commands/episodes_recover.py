@@ -1,4 +1,4 @@
-"""Make valid bags of the episodes that a crash or a full disk interrupted.
+"""Complete the files of episodes that a crash or a full disk interrupted.
 
 Exit code 0: no unfinished episode is left; 1: an episode could not be recovered (stderr names it);
 2: bad usage.
@@ -69,7 +69,7 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _find(directory: Path) -> list[Leftover]:
-    """Return the unfinished episodes in a folder, or the one that `directory` names."""
+    """Return the unfinished episodes in a folder, or only `directory` if it is one itself."""
     path = Path(os.path.abspath(directory))
     if files.active_name(path) is None:
         return find_leftovers(directory)

@@ -1,7 +1,6 @@
 """Start and stop the nodes of this package as child processes.
 
-Executables are found through entry points, so that a simulator node starts a policy without
-importing it.
+Executables are found through entry points, so no code of `policy_node` is imported here.
 """
 
 from __future__ import annotations
@@ -26,7 +25,9 @@ _SHUTDOWN_TIMEOUT = 10.0
 
 
 def executable(name: str, parent: int | None = None) -> list[str]:
-    """Return the command that runs an executable, which terminates when process `parent` does.
+    """Return the command line that runs an executable of this package.
+
+    The started process terminates when the process with the id `parent` does.
 
     Raises:
         UsageError: If this package runs from its sources and is not installed.
@@ -45,7 +46,8 @@ def executable(name: str, parent: int | None = None) -> list[str]:
 def is_actor_shipped(task: str) -> bool:
     """Return whether an installed package ships an actor for a task.
 
-    Entry points of the group `fetch_hand_sim.actors` name functions that return actors by task.
+    Packages name a function in the entry point group `fetch_hand_sim.actors`. It returns the
+    shipped actors by task.
     """
     return any(task in point.load()() for point in entry_points(group=_ACTORS))
 
@@ -61,7 +63,10 @@ def open_log(name: str) -> IO[str]:
 def start_node(
     name: str, parameters: Mapping[str, object], output: IO[str], namespace: str = ''
 ) -> subprocess.Popen[str]:
-    """Start a node that terminates with this process and does not receive its Ctrl-C."""
+    """Start the executable `name` as a child process that terminates when this process does.
+
+    Ctrl-C in the terminal does not reach it; `output` receives its stdout and stderr.
+    """
     words = []
     for parameter, value in parameters.items():
         # ROS reads values as YAML: unquoted text may be a date, a number or a comment.
@@ -80,7 +85,7 @@ def start_node(
 def start_nodes(
     nodes: Mapping[str, Mapping[str, object]], output: IO[str], namespace: str = ''
 ) -> list[subprocess.Popen[str]]:
-    """Start several nodes, all or none: parameters by executable. See `start_node`."""
+    """Start several nodes, given as parameters by executable; if one fails, stop the others."""
     started: list[subprocess.Popen[str]] = []
     try:
         for name, parameters in nodes.items():
@@ -93,7 +98,7 @@ def start_nodes(
 
 
 def stop_node(process: subprocess.Popen[str]) -> int:
-    """Terminate a node; return its exit code, or 0 if it had not finished loading."""
+    """Terminate a node and return its exit code; 0 if SIGTERM ended it while it was loading."""
     if process.poll() is not None:
         return process.returncode
     # SIGINT would print a traceback while Python starts.

@@ -27,7 +27,7 @@ def add_filter_options(parser: argparse.ArgumentParser) -> None:
 
 
 def is_wanted(options: argparse.Namespace, task: str | None, episode: HasOutcome) -> bool:
-    """Return whether an episode passes the filters; an unknown outcome fails both of them."""
+    """Return whether an episode passes the filters; an unknown success passes neither filter."""
     return (
         options.task in (None, task)
         and options.success in (None, episode.outcome.is_success)
@@ -36,7 +36,7 @@ def is_wanted(options: argparse.Namespace, task: str | None, episode: HasOutcome
 
 
 def two_numbers(largest: int) -> Callable[[str], tuple[int, int]]:
-    """Return a parser of `640x480` for `add_argument(type=...)`; each number is 1 to `largest`."""
+    """Return an argparse type for two numbers from 1 to `largest`, written as in `640x480`."""
 
     def read(text: str) -> tuple[int, int]:
         try:

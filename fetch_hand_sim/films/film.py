@@ -35,7 +35,7 @@ _PALETTE_SAMPLES = 8
 
 
 class Roll:
-    """Pictures (height, width, 3) uint8 of one size, stored in memory with lossless compression."""
+    """A list of pictures (height, width, 3) uint8 of one size with lossless compression."""
 
     def __init__(self) -> None:
         self._file = BytesIO()
@@ -53,18 +53,18 @@ class Roll:
         self._count += 1
 
     def picture(self, number: int) -> Picture:
-        """Return one picture, read-only."""
+        """Return picture `number`, from 0, as a read-only array."""
         image = self.open()
         image.seek(number)
         return np.asarray(image)
 
     def open(self) -> Image.Image:
-        """Return all pictures as one image, which decodes one frame at a time."""
+        """Return all pictures as the frames of one Pillow image."""
         return Image.open(self._file)
 
 
 def check_kind(path: Path) -> None:
-    """Raise ValueError unless a film or picture can be written to the path."""
+    """Raise ValueError unless suffix and folder of the path allow a film or picture there."""
     kind = path.suffix.lower()
     if kind not in (*MOVING, *STILL):
         raise ValueError(
@@ -79,7 +79,7 @@ def check_kind(path: Path) -> None:
 
 
 def check_size(path: Path, width: int, height: int) -> None:
-    """Raise ValueError unless the format can store pictures of a size."""
+    """Raise ValueError unless the format of the path allows pictures of this size, pixels."""
     kind = path.suffix.lower()
     largest = _LARGEST_SIDE.get(kind)
     if largest is not None and max(width, height) > largest:
@@ -91,11 +91,11 @@ def check_size(path: Path, width: int, height: int) -> None:
 def write_film(
     path: Path, pictures: Iterable[Picture], fps: float, keyframe_every: int = 0
 ) -> None:
-    """Write pictures (height, width, 3) of one size; the file appears when it is complete.
+    """Write pictures (height, width, 3) of one size as a film; the file appears when complete.
 
     Args:
-        fps: Pictures per second. GIF and WebP show at most 50, so above that every n-th picture
-            is written and the duration stays the same.
+        fps: Pictures per second. GIF and WebP show at most 50. Above that, only every n-th picture
+            is written, so that the duration stays the same.
         keyframe_every: Pictures between two keyframes of an .mp4, for programs that seek in it;
             0 leaves the choice to the encoder.
 
@@ -111,7 +111,7 @@ def write_film(
 
 
 def write_picture(path: Path, picture: Picture) -> None:
-    """Write one picture (height, width, 3) as .png or .jpg, which appears when it is complete."""
+    """Write one picture (height, width, 3) as .png or .jpg; the file appears when complete."""
     with _appearing(path) as hidden:
         Image.fromarray(picture).save(hidden, quality=85, optimize=True)
 
@@ -138,7 +138,7 @@ def write_animation(
 
 
 def _with_one_palette(roll: Roll) -> Iterator[Image.Image]:
-    """Yield the pictures as images with a common palette; with separate ones colours flicker."""
+    """Yield the pictures with one common palette, because separate palettes flicker."""
     some = range(0, len(roll), max(1, len(roll) // _PALETTE_SAMPLES))
     samples = Image.fromarray(np.concatenate([roll.picture(number) for number in some]))
     palette = samples.quantize(_GIF_COLORS)
@@ -189,7 +189,7 @@ def _ffmpeg() -> str:
 
 @contextmanager
 def _appearing(path: Path) -> Iterator[Path]:
-    """Yield a hidden file beside the path, which replaces the path on success."""
+    """Yield the path of a temporary hidden file, which is renamed to `path` on success."""
     # Follow a link, so that it stays a link.
     target = path.resolve()
     # The process id keeps two processes apart that write the same film.

@@ -101,12 +101,12 @@ class Film:
         return file
 
     def __repr__(self) -> str:
-        """Return the number of pictures, their size and the duration."""
+        """Return a text with number and size of the pictures and the duration."""
         height, width = self._shape[:2]
         return f'Film({len(self)} pictures of {width}x{height}, {len(self) / self.fps:.1f} s)'
 
     def _repr_html_(self) -> str:
-        """Return the film as HTML with embedded data, which a notebook saves with the page."""
+        """Return the film as HTML with embedded data, which notebooks show and save."""
         if not self._html:
             buffer = io.BytesIO()
             write_animation(buffer, self, self.fps, '.webp')
@@ -133,9 +133,9 @@ def film_episode(env: gymnasium.Env[Any, Any], policy: Any, seed: int | None = N
 
     Args:
         env: Made with `render_mode='rgb_array'`.
-        policy: An object with `predict(observation, state, deterministic=True)`, like the
-            models of Stable-Baselines3; or a function from observation to
-            action. `state` is left out while it is None.
+        policy: A function from observation to action; or an object with
+            `predict(observation, state, deterministic=True)`, like the models of Stable-Baselines3.
+            A state of None is not passed.
         seed: Seed of the reset; None continues the random generator.
 
     Raises:
@@ -184,7 +184,7 @@ def _played(
 
 
 def _most_steps(env: gymnasium.Env[Any, Any]) -> int | None:
-    """Return the steps to film if no wrapper limits an environment of this package, else None."""
+    """Return `episode_ticks` for an environment of this package without a time limit, else None."""
     while isinstance(env, gymnasium.Wrapper):
         if isinstance(env, TimeLimit):
             return None

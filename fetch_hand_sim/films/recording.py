@@ -1,4 +1,4 @@
-"""Read episode files as frames, and draw them: one after the other, or many side by side."""
+"""Read episode files as frames, and draw one episode, or many side by side."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from msgs_spec.tasks import TaskSpec
 
 @dataclass(frozen=True, slots=True)
 class Recording:
-    """One episode of N steps: N + 1 frames and their times (N + 1,), s since the first frame."""
+    """An episode of N steps that can be drawn: N + 1 frames and their times (N + 1,), s from 0."""
 
     arrays: EpisodeArrays
     frames: list[Frame]
@@ -37,17 +37,17 @@ class Recording:
 
     @property
     def metric(self) -> GoalMetric:
-        """The metric with the success rule of the episode."""
+        """The goal metric of the task with the success rule of the episode."""
         return GoalMetric(self.spec, success_rule=self.arrays.record.success_rule)
 
 
 def load_recording(path: Path) -> Recording:
-    """Read an episode."""
+    """Read an episode file as frames."""
     return recording_of(load_episode(path))
 
 
 def recording_of(arrays: EpisodeArrays) -> Recording:
-    """Add the joint positions and object poses of the file to an episode."""
+    """Make frames of a loaded episode; reads joint positions and object poses from its file."""
     task, stamps = arrays.record.task, arrays.stamps
     file, poses = read_episode(arrays.path), None
     with one_line_errors(file.path):
@@ -90,7 +90,7 @@ def load_recordings(
 
 
 def none_readable(errors: Sequence[EpisodeReadError]) -> EpisodeReadError:
-    """Return one error for the errors of several episodes, at least one."""
+    """Return one error that stands for all errors of several unreadable episodes."""
     first, *others = errors
     if not others:
         return first
@@ -98,7 +98,7 @@ def none_readable(errors: Sequence[EpisodeReadError]) -> EpisodeReadError:
 
 
 def find_playable(path: Path) -> list[Path]:
-    """Return the episodes of a path by name, without reading them, or raise EpisodeReadError."""
+    """Return the episodes of a file or folder, sorted by name; EpisodeReadError without one."""
     paths = expand_episodes(path)
     if not paths:
         raise holds_no_episode(path)
@@ -114,10 +114,10 @@ _SAME_TIME = 1e-6
 
 
 class Studio:
-    """Draws recordings of any tasks in one size; each model is compiled once.
+    """Draws recordings of any tasks as pictures of one size.
 
-    The methods that draw raise ValueError if the frame or the camera does not exist, and
-    RuntimeError without OpenGL.
+    Methods that draw raise ValueError if the frame or the camera does not exist, and RuntimeError
+    without OpenGL.
     """
 
     def __init__(self, width: int, height: int, camera: str | None = None) -> None:
@@ -137,7 +137,7 @@ class Studio:
         return renderer.render(frames[index], trail_of(frames, index))
 
     def plain(self, recording: Recording, index: int) -> Picture:
-        """Return the picture of one frame without trail, and with a goal of one colour."""
+        """Return the picture of one frame for learning: without trail and success colour."""
         frame = recording.frames[self._index(recording, index)]
         frame = replace(frame, is_success=False)
         return self._renderer(recording.spec.name).render(frame, [])
@@ -148,7 +148,7 @@ class Studio:
         return with_edge(picture) if recording.frames[index].is_success else picture
 
     def close(self) -> None:
-        """Free OpenGL."""
+        """Free all OpenGL contexts."""
         for renderer in self._renderers.values():
             renderer.close()
         self._renderers.clear()
@@ -168,13 +168,13 @@ class Studio:
 
 
 def sheet_size(count: int, columns: int, width: int, height: int) -> tuple[int, int]:
-    """Return width and height, pixels, of `count` pictures of one size side by side."""
+    """Return width and height, pixels, of the sheet that `tile` makes of `count` pictures."""
     rows = -(-count // columns)
     return columns * (width + _GAP) - _GAP, rows * (height + _GAP) - _GAP
 
 
 def tile(pictures: Sequence[Picture], columns: int) -> Picture:
-    """Put pictures of one size side by side, row by row; empty places are white."""
+    """Join pictures of one size to one sheet, row by row; empty places are white."""
     height, width = pictures[0].shape[:2]
     total_width, total_height = sheet_size(len(pictures), columns, width, height)
     sheet = np.full((total_height, total_width, 3), 255, dtype=np.uint8)
@@ -187,7 +187,10 @@ def tile(pictures: Sequence[Picture], columns: int) -> Picture:
 def grid(
     studio: Studio, recordings: Sequence[Recording], columns: int, hz: float
 ) -> Iterator[Picture]:
-    """Yield sheets of all recordings at the same time; finished episodes show their last frame."""
+    """Yield sheets, `hz` per second, that show all recordings side by side at the same time.
+
+    A recording that has ended shows its last frame.
+    """
     shown = [-1] * len(recordings)
     pictures: list[Picture] = [np.zeros(0, np.uint8)] * len(recordings)
     for count in range(sheets(recordings, hz)):
@@ -200,7 +203,7 @@ def grid(
 
 
 def sheets(recordings: Sequence[Recording], hz: float) -> int:
-    """Return the number of sheets that `grid` yields, to the end of the longest recording."""
+    """Return the number of sheets that `grid` yields until the longest recording ends."""
     longest = max(float(recording.times[-1]) for recording in recordings)
     return 1 + math.ceil(longest * hz - _SAME_TIME)
 

@@ -1,8 +1,8 @@
 """`replay_node`: publishes a logged episode on its topics with its timing.
 
-Every subscriber of a robot can subscribe to the replay, including `policy_node`. Recorded commands
-are published on request only, because they would mix with those of a policy. `schedule.py` contains
-the messages and their times, without ROS; `node.py` is the node.
+Subscribers cannot distinguish it from a robot, so `policy_node` works with a replay, too. Recorded
+commands are published only on request, because they would mix with those of a policy. `schedule.py`
+computes what to publish when, without ROS; `node.py` is the node.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The ROS node around a `ReplaySchedule`."""
+"""The ROS node that publishes the messages of a `ReplaySchedule`."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _CLOCK = '/clock'
 
 
 class ReplayNode(Node):
-    """Publish an episode, once or in a loop."""
+    """Publishes a logged episode, once or in a loop."""
 
     def __init__(self) -> None:
         super().__init__(NODE_NAME, start_parameter_services=False)
@@ -87,7 +87,7 @@ class ReplayNode(Node):
         return f'{namespace}/{name.removeprefix(recorded)}'
 
     def run(self, stop: StopSignals) -> None:
-        """Publish until the end of the episode or a signal; UsageError for topics in use."""
+        """Publish until the end or a signal; UsageError if another node publishes a topic."""
         loop = EventLoop(self)
         self.get_logger().info(self._description())
         try:
@@ -102,7 +102,7 @@ class ReplayNode(Node):
             loop.close()
 
     def _require_free_topics(self, loop: EventLoop, stop: StopSignals) -> None:
-        """Reject topics that have another publisher: subscribers would mix both robots."""
+        """Raise UsageError if a topic has another publisher, unless `force` is set."""
         if self._settings['force']:
             return
         while not stop and time.monotonic() < self._created_at + DISCOVERY_TIME:
@@ -124,7 +124,7 @@ class ReplayNode(Node):
                 )
 
     def _description(self) -> str:
-        """Return a line about the episode, the pace and the topics."""
+        """Return a log line with the episode, its pace and the namespace of the topics."""
         seconds = (self._schedule.end_ns - self._start_ns) / 1e9
         parts = [
             f'{self._settings["path"]}: {seconds:.2f} s, at {self._settings["rate"]:g} x real time',
@@ -137,9 +137,10 @@ class ReplayNode(Node):
         return '; '.join(parts)
 
     def _wait_for_commander(self, loop: EventLoop, stop: StopSignals) -> None:
-        """Publish the latched topics, then wait until a policy has connected to all topics.
+        """Publish the latched topics; with `wait_for_commands`, wait until a policy is connected.
 
-        The policy selects its task by them, and would otherwise miss the first observation.
+        The policy reads its task from the latched topics. Without the wait, it would miss the first
+        observation.
         """
         self._publish_latched()
         if not self._settings['wait_for_commands']:
@@ -157,7 +158,7 @@ class ReplayNode(Node):
             listeners.update()
 
     def _begin(self) -> None:
-        """Go to the start."""
+        """Move the playhead to the start of the replay."""
         self._next = self._schedule.index_at(self._start_ns)
         self._playhead.jump(self._start_ns, time.monotonic())
 
@@ -172,7 +173,7 @@ class ReplayNode(Node):
         return False
 
     def _serve(self, loop: EventLoop) -> None:
-        """Serve callbacks until the next message is due, but no longer than a beat."""
+        """Serve callbacks until the next message is due, but at most for `BEAT` seconds."""
         messages = self._schedule.messages
         due = messages[self._next].time_ns if self._next < len(messages) else self._end_ns
         remaining = self._playhead.remaining(due, time.monotonic())

@@ -23,7 +23,7 @@ _SHOWN = 80
 
 @dataclass(frozen=True, slots=True)
 class ReplayMessage:
-    """A message to publish."""
+    """A message to publish at log time `time_ns` on the topic `name`."""
 
     time_ns: int
     name: str
@@ -31,15 +31,17 @@ class ReplayMessage:
 
 
 class ReplaySchedule:
-    """The messages to publish, in order.
+    """The messages of an episode to publish, sorted by log time.
 
     Args:
-        with_inputs: Whether to publish also the received commands and goals.
+        path: The episode.
+        topics: Topics to publish; none selects all that the robot published.
+        with_inputs: Whether all topics include commands and goals that the robot received.
 
     Attributes:
         start_ns: Log time of the first message of the episode, published or not.
-        end_ns: Log time of its last message.
-        period_ns: Recorded nanoseconds per tick.
+        end_ns: Log time of the last message of the episode.
+        period_ns: Nanoseconds of simulated time per tick.
         namespace: ROS namespace of the recorded robot; '' for the root.
     """
 
@@ -72,9 +74,9 @@ class ReplaySchedule:
         return bisect_left(self.messages, time_ns, key=lambda message: message.time_ns)
 
     def latched_at(self, time_ns: int) -> list[ReplayMessage]:
-        """Return the last message before a time of each latched topic, or else its first message.
+        """Return one message of each latched topic: the last before `time_ns`, or else the first.
 
-        So subscribers know the robot from the start.
+        Published at the start, they describe the robot to subscribers.
         """
         found: dict[str, ReplayMessage] = {}
         for message in self.messages:
@@ -103,9 +105,9 @@ def _require_names(names: Iterable[str]) -> None:
 
 
 class Playhead:
-    """Position in an episode over time.
+    """Computes the current position of a replay, a log time.
 
-    `now` is seconds of any steady clock, `rate` recorded seconds per second; 0 pauses.
+    `now` is the time of any steady clock, s. `rate` is simulated seconds per second; 0 pauses.
     """
 
     def __init__(self, position_ns: int, rate: float, now: float) -> None:
@@ -124,10 +126,10 @@ class Playhead:
         return (time_ns - self._position_ns) / 1e9 / self.rate - (now - self._since)
 
     def set_rate(self, rate: float, now: float) -> None:
-        """Change the rate from now on."""
+        """Change the rate at time `now`; the position does not jump."""
         self.jump(self.position_ns(now), now)
         self.rate = rate
 
     def jump(self, position_ns: int, now: float) -> None:
-        """Go to a position."""
+        """Set the position at time `now`."""
         self._position_ns, self._since = position_ns, now

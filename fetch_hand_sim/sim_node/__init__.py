@@ -1,7 +1,7 @@
-"""`sim_node`: one simulated robot on the network.
+"""`sim_node`: a ROS node that simulates one robot.
 
-`robot.py` is the robot without ROS, `node.py` the node around it. Slow imports happen in `main`,
-after its handlers of signals.
+`robot.py` is the robot without ROS, `node.py` its node. `main` imports slow modules after it has
+set the signal handlers.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The ROS graph around a simulator node: publishers of its inputs, subscribers, other robots."""
+"""Watch the ROS graph of a simulator node: publishers of its inputs, subscribers, other robots."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Endpoint:
-    """A publisher found on the graph; `node` and `topic` are fully qualified."""
+    """A publisher in the ROS graph; `node` and `topic` are fully qualified names."""
 
     node: str
     topic: str
@@ -28,11 +28,11 @@ class Endpoint:
 
 
 class InputWatch:
-    """Publishers of the topics that a robot subscribes to, and what is wrong with them.
+    """Stores the publishers of the topics that a robot subscribes to, and finds problems.
 
     Args:
-        types: The type of each topic.
-        commands: The topics of these that carry commands.
+        types: Message type by topic.
+        commands: Topics in `types` that carry commands.
     """
 
     def __init__(self, types: Mapping[str, str], commands: Sequence[str]) -> None:
@@ -44,7 +44,7 @@ class InputWatch:
 
     @property
     def commanders(self) -> list[str]:
-        """Nodes whose commands arrive, sorted; two processes of one name count twice."""
+        """Sorted names of the nodes that command; a name used by two processes occurs twice."""
         copies: dict[str, int] = {}
         for topic in self._commands:
             for node in {endpoint.node for endpoint in self._endpoints}:
@@ -61,7 +61,7 @@ class InputWatch:
         )
 
     def problems(self) -> list[str]:
-        """Return one line for each problem, such as two commanders or another message type."""
+        """Return one line for each problem, such as two commanders or a wrong message type."""
         problems, names = [], self.commanders
         if len(names) > 1:
             problems.append(f'{len(names)} publish commands: {", ".join(names)}')
@@ -84,7 +84,7 @@ class InputWatch:
         return len(ages) if ages and min(ages) > MEMORY_OF_THE_GRAPH else min(len(ages), 1)
 
     def _mismatch(self, endpoint: Endpoint) -> str:
-        """Return why messages of a publisher never arrive, or ''."""
+        """Return why the robot cannot receive from a publisher; '' if it can."""
         allowed = self.types[endpoint.topic]
         if endpoint.type_name != allowed:
             return f'its type is {endpoint.type_name}; allowed: {allowed}'
@@ -92,12 +92,12 @@ class InputWatch:
 
 
 class GraphWatch:
-    """The state of the graph at the last `update`.
+    """The state of the ROS graph at the last `update`.
 
     Attributes:
-        inputs: Publishers of the subscribed topics.
+        inputs: Publishers of the topics that the robot subscribes to.
         clock_publishers: Other nodes that publish `/clock`.
-        robots: Nodes that publish the same `episode_status`, this one included.
+        robots: Nodes that publish `episode_status` in this namespace, this node included.
         has_newcomer: Whether a commander or subscriber is new since this was last set to False.
     """
 
@@ -135,7 +135,7 @@ class GraphWatch:
         return self._subscribers.are_connected()
 
     def waiting_elsewhere(self) -> list[str]:
-        """Return a line for each policy that waits for a robot in another namespace."""
+        """Return a line for each node that waits for the `episode_status` of a missing robot."""
         return [
             f'{full_name(info.node_namespace, info.node_name)} waits for a robot on {name}'
             for name, _ in self._node.get_topic_names_and_types()

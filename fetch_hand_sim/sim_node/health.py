@@ -1,4 +1,4 @@
-"""The health of a simulator node, for `/diagnostics` and the log."""
+"""Report the state and the problems of a simulator node to `/diagnostics` and the log."""
 
 from __future__ import annotations
 
@@ -40,14 +40,14 @@ Problem = tuple[Level, str]
 class Health:
     """Reports on a robot to `/diagnostics` and to the log of its node.
 
-    Counters and rates are over the time between two reports. Times are seconds of one steady clock.
+    Rates are measured between two reports. Times are seconds of one steady clock.
 
     Args:
         node: The simulator node, with the parameters `episode_dir` and `publish_clock`.
         robot: The robot.
-        watch: The graph, kept up to date by the node.
+        watch: State of the ROS graph, which the node updates.
         recorder: Logs the episodes; None if logging is off.
-        now: The time.
+        now: Present time, at which the first report begins.
     """
 
     def __init__(
@@ -78,11 +78,11 @@ class Health:
 
     @property
     def has_log_failed(self) -> bool:
-        """True if logging has stopped."""
+        """True if an error has stopped logging."""
         return self._recorder is not None and self._recorder.has_failed
 
     def messages(self, now: float) -> Messages:
-        """Return the messages about the time since the last call, and log new problems."""
+        """Return the messages to publish about the time since the last call; log new problems."""
         report = self.report(now)
         self._log_news()
         factor = self._factor_codec.encode(0, [self._real_time_factor])
@@ -120,7 +120,7 @@ class Health:
         return report
 
     def _passing_problems(self, grown: Mapping[str, int], seconds: float) -> Iterator[Problem]:
-        """Yield problems that happened since the last report, from the increase of each counter."""
+        """Yield problems of the last `seconds`; `grown` is the increase of each counter."""
         robot = self._robot
         schedule, buffer = robot.schedule, robot.buffer
         asked = schedule.asked_rate if robot.runner.has_started else None
@@ -147,7 +147,7 @@ class Health:
             yield Level.ERROR, self._log()
 
     def _lasting_problems(self) -> Iterator[Problem]:
-        """Yield the problems that stay until the user acts; the log names them when they begin."""
+        """Yield problems that last until the user acts, such as two robots in one namespace."""
         watch, buffer = self._watch, self._robot.buffer
         if len(watch.robots) > 1:
             yield (
@@ -170,7 +170,7 @@ class Health:
             yield Level.WARN, f'commands have stopped, the robot {reaction}; {source}'
 
     def _waiting(self) -> str:
-        """Return which tick waits for a command, and which nodes should send it."""
+        """Return a line that names the tick that waits for a command, and likely causes."""
         runner, rejection = self._robot.runner, self._robot.buffer.last_rejection
         tick = f'tick {runner.current.tick + 1} of episode {runner.episode}'
         if runner.is_between_episodes:
@@ -179,7 +179,7 @@ class Health:
         return f'{tick} waits for a valid command; {self._command_source()}{last}'
 
     def _command_source(self) -> str:
-        """Return the end of a sentence: which nodes should send commands."""
+        """Return the part of a line that names the nodes from which commands are missing."""
         if names := self._watch.inputs.commanders:
             return f'{", ".join(names)} {"sends" if len(names) == 1 else "send"} none'
         return '; '.join(['no node publishes any', *self._watch.waiting_elsewhere()])
@@ -228,7 +228,7 @@ class Health:
         }
 
     def _log_news(self) -> None:
-        """Log changes of the commanders, and each lasting problem once when it begins."""
+        """Log changes of the commanding nodes, and each lasting problem when it begins."""
         logger, buffer = self._node.get_logger(), self._robot.buffer
         commanders = self._watch.inputs.commanders
         if commanders != self._commanders:

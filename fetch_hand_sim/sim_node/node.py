@@ -1,6 +1,6 @@
-"""The ROS node of a `Robot`.
+"""The ROS node of a simulated robot.
 
-One thread does everything but writing log files: a tick takes 2 of 40 ms.
+One thread does all work except writing log files; at 25 Hz a tick takes 2 of 40 ms.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ class SimNode(Node):
     # Set-up
 
     def _reject_simulated_time(self) -> None:
-        """Stay in wall time where a launch file sets `use_sim_time` for all nodes."""
+        """Set `use_sim_time` back to false, which some launch files set to true for all nodes."""
         if self.get_parameter('use_sim_time').value:
             self.set_parameters([Parameter('use_sim_time', value=False)])
             self.get_logger().warning(
@@ -130,7 +130,7 @@ class SimNode(Node):
         return publishers
 
     def _open_ground_truth(self) -> None:
-        """Publish the undisturbed state on topics of its own from the first disturbance on."""
+        """Open the topics for the undisturbed state, if disturbances are on."""
         if read_disturbances(self._settings['disturbances']).is_off:
             return
         for spec in ground_truth_topics(self._robot.runner.spec):
@@ -172,7 +172,7 @@ class SimNode(Node):
     # Running
 
     def run(self, stop: StopSignals) -> None:
-        """Run episodes until all are done or a signal; NodeFailure if not all were logged."""
+        """Run until all episodes are done or a signal arrives; NodeFailure if logging failed."""
         loop = EventLoop(self)
         self.get_logger().info(self._description())
         try:
@@ -193,7 +193,7 @@ class SimNode(Node):
             raise NodeFailure(f'not all episodes are in {self._settings["episode_dir"]}')
 
     def _description(self) -> str:
-        """Return a line about the task, the pace, the topics and the log."""
+        """Return a log line with the task, the pace, the namespace and the log folder."""
         values = self._settings
         pace = 'as fast as possible'
         if values['mode'] == 'lockstep':
@@ -207,7 +207,7 @@ class SimNode(Node):
         )
 
     def _wait_for_commander(self, loop: EventLoop, stop: StopSignals) -> None:
-        """Stand still until a connected policy publishes commands, or a step starts the episode."""
+        """Wait until a policy is connected and publishes commands, or a service runs a tick."""
         watch = self._watch
         while not (watch.inputs.commanders and watch.are_subscribers_connected()):
             if stop or self._robot.runner.has_started:
@@ -225,7 +225,7 @@ class SimNode(Node):
             loop.wait(BEAT)
 
     def _serve_until_due(self, loop: EventLoop, stop: StopSignals) -> None:
-        """Serve one callback, or all waiting ones and then the due tick."""
+        """Run the tick if it is due, after waiting callbacks; otherwise serve one callback."""
         remaining = self._robot.wait()
         if remaining > 0.0:
             loop.wait(min(remaining, BEAT))
@@ -239,9 +239,9 @@ class SimNode(Node):
             self._ticked_at = time.monotonic()
 
     def _beat_when_due(self) -> None:
-        """Publish the latest tick, read the graph and report health, a few times a second.
+        """Do periodic work every `BEAT` seconds: `latest_tick`, ROS graph, diagnostics.
 
-        A tick that is due soon goes first.
+        If a tick is due soon, the tick runs first.
         """
         now = time.monotonic()
         if now < self._beat_due or (
@@ -259,7 +259,7 @@ class SimNode(Node):
             self._publish(self._health.messages(now))
 
     def _stand_still(self, now: float) -> None:
-        """While no tick runs: publish `/clock`, repeat the last tick for new subscribers, warn."""
+        """While no tick runs, publish `/clock` and repeat the last tick for new subscribers."""
         robot, watch = self._robot, self._watch
         has_started = robot.runner.has_started
         if robot.schedule.is_paused or not has_started:

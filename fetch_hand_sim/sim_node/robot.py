@@ -29,7 +29,7 @@ _LONGEST_SILENCE = 1.0
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """The answer of a service: success, and the effect or the reason."""
+    """The response of a service; `message` describes the effect, or why the call failed."""
 
     success: bool
     message: str
@@ -41,9 +41,9 @@ class Counters:
 
     Attributes:
         ticks: Published ticks, resets included.
-        given_up: Episodes ended by a reset.
-        late_commands: Steps in real time whose command did not answer the last tick.
-        tick_time: Wall time of a tick: command, physics, encoding, publishing, logging.
+        given_up: Episodes that a reset ended early.
+        late_commands: Steps in real time without the command that answers the last tick.
+        tick_time: Wall-clock time of ticks: physics, encoding, publishing and logging.
     """
 
     ticks: int = 0
@@ -58,13 +58,13 @@ class Counters:
 
 
 class Robot:
-    """Ticks when they are due, and executes services and received goals.
+    """Simulates a robot tick by tick, and executes services and received goals.
 
     Attributes:
         counters: Counts since the start.
-        perturb_limit: Largest force of a push, N; 0 rejects all.
-        has_commander: Whether the first episode waited for a policy, which answers from then on.
-        last_messages: Messages of the last tick, to be repeated for new subscribers.
+        perturb_limit: Largest force of a push, N; 0 rejects all pushes.
+        has_commander: Whether the first episode waited for a policy, so that commands are expected.
+        last_messages: Messages of the last tick, which are repeated for new subscribers.
     """
 
     def __init__(
@@ -90,7 +90,7 @@ class Robot:
         self._late_commands = 0
 
     def wait(self) -> float:
-        """Return the seconds until the next tick is due; the first reset needs no command."""
+        """Return the seconds until the next tick; infinity if a command or service must come."""
         now = self._clock()
         has_command = self.buffer.has_fresh_command or not self.runner.has_started
         wait = self.schedule.wait(now, has_command, self.lacks_answer)
@@ -104,15 +104,15 @@ class Robot:
 
     @property
     def is_reset_due(self) -> bool:
-        """True if a requested reset is due as a tick of its own."""
+        """True if a robot that stands still must now run the reset that a service requested."""
         return self._reset_due is not None and self._reset_due <= self._clock()
 
     @property
     def misses_commands(self) -> bool:
-        """True if an expected command is a second or more late, pauses left out.
+        """True if an expected command is more than a second late; pauses do not count.
 
-        In lockstep every tick expects one. In real time commands are expected after the first; the
-        limit is longer where `command_timeout` or two ticks in slow motion are longer.
+        In lockstep every tick expects a command. In real time commands are expected after the first
+        one, and the limit is at least `command_timeout` and two tick periods.
         """
         schedule = self.schedule
         if schedule.is_paused or not self.runner.has_started:
@@ -125,10 +125,10 @@ class Robot:
 
     @property
     def lacks_answer(self) -> bool:
-        """True if the command that answers the last tick may still arrive.
+        """True if the command computed from the last tick is expected but has not arrived.
 
-        A command that names no observation answers the last tick before it. Only a robot in real
-        time that receives commands expects an answer.
+        This applies in real time while commands arrive. A command that names no observation counts
+        as the answer to the tick before it.
         """
         if self.schedule.mode == 'lockstep' or self.schedule.is_paused:
             return False
@@ -174,19 +174,19 @@ class Robot:
     # Messages without a tick
 
     def waiting_status(self) -> Messages:
-        """Return `/clock` and `episode_status` of a robot that has not started."""
+        """Return the `/clock` and `episode_status` messages of a robot that has not started."""
         stamp_ns = self.runner.stamp_ns
         status = self._encoder.encode_status(stamp_ns, self.runner.waiting_status())
         return [self.clock_message(), status]
 
     def clock_message(self) -> tuple[TopicSpec, bytes]:
-        """Return `/clock` at the present simulated time."""
+        """Return the `/clock` message with the present simulated time."""
         return self._encoder.encode_clock(self.runner.stamp_ns)
 
     # Received messages
 
     def set_goal(self, topic: TopicSpec, message: Any) -> None:
-        """Replace the goal of the running episode from the next tick on."""
+        """Replace the goal of the running episode from the next tick on; ValueError if invalid."""
         try:
             accept_goal(self.runner, topic, message)
         except ValueError as error:
@@ -195,14 +195,17 @@ class Robot:
         self.counters.goals_set += 1
 
     def count_rejected_goal(self, reason: str) -> None:
-        """Count a rejected goal and keep the reason."""
+        """Count a rejected goal and store the reason for diagnostics."""
         self.counters.goals_rejected += 1
         self.counters.last_goal_rejection = reason
 
     # Services and parameters
 
     def reset(self, *, to_first_episode: bool = False) -> Answer:
-        """End the running episode; a robot that stands still starts the next one by itself."""
+        """End the running episode; the next tick starts the next one, or the first one again.
+
+        A robot that stands still runs this tick without a command.
+        """
         runner = self.runner
         episode, was_running = runner.episode, not runner.is_between_episodes
         if was_running:
@@ -222,10 +225,10 @@ class Robot:
         return Answer(True, f'{ends}; a tick of its own {starts}')
 
     def _silence_begins(self) -> float:
-        """Return the time after which a command for the last tick no longer arrives.
+        """Return the time from which no command for the last tick can arrive any more.
 
-        Such a command would otherwise answer the state after the reset, and the policy would lag
-        one tick behind from then on.
+        If such a command arrived after the reset, it would be taken as the answer to the reset, and
+        all later commands would be one tick late.
         """
         is_answered = self.schedule.is_paused or self.buffer.has_fresh_command
         return self._clock() if is_answered else self._ticked_at + _ANSWER_TIME
@@ -239,7 +242,7 @@ class Robot:
         return Answer(True, f'{"paused" if paused else "running"} at {self._now()}')
 
     def step(self, ticks: int = 1) -> Answer:
-        """Run ticks at once."""
+        """Run several ticks immediately; fails in real time unless paused."""
         if self.schedule.mode == 'realtime' and not self.schedule.is_paused:
             return Answer(False, 'a running simulation cannot be stepped; pause it first')
         if not 1 <= ticks <= MAX_STEPS:
@@ -262,9 +265,9 @@ class Robot:
 
 
 class Receivers:
-    """Pass received messages to a robot; rejected ones are counted and reported, never raised.
+    """Passes received messages to a robot and to the log; rejected messages only cause a warning.
 
-    The log contains every readable message, also rejected commands. Unreadable and oversized bytes
+    The log contains every readable message, also rejected ones. Unreadable and oversized messages
     are dropped.
     """
 
@@ -294,7 +297,7 @@ class Receivers:
         }
 
     def callback(self, spec: TopicSpec) -> Callable[[bytes], None]:
-        """Return the callback of a raw subscription."""
+        """Return the callback for a subscription that receives CDR bytes."""
         handle = self._handlers[spec.name]
 
         def on_message(data: bytes) -> None:
@@ -315,7 +318,7 @@ class Receivers:
         return on_message
 
     def _read(self, spec: TopicSpec, data: bytes) -> Any:
-        """Return the message, or None after counting and reporting unreadable bytes."""
+        """Decode a message; None, with a warning, if it is unreadable or too long."""
         try:
             require_short(data)
         except ValueError as error:

@@ -1,4 +1,4 @@
-"""The time of the next tick, and the topic `latest_tick` at a limited rate."""
+"""Compute when ticks are due, and publish the topic `latest_tick` at a limited rate."""
 
 from __future__ import annotations
 
@@ -20,17 +20,18 @@ _PERIOD = 1.0 / LATEST_TICKS_PER_SECOND
 
 
 class TickSchedule:
-    """Deadlines of ticks. Times are seconds of any steady clock; the first tick is due at once.
+    """Computes when ticks are due. Times are seconds of any steady clock.
 
     Args:
-        mode: `realtime` follows the clock, `lockstep` the commands.
+        mode: `realtime` runs ticks at fixed times, `lockstep` one tick per command.
         tick_duration: Simulated seconds per tick.
         real_time_factor: Simulated seconds per second; 0 is as fast as possible.
+        now: Present time, at which the first tick is due.
 
     Attributes:
         changes: Number of pauses, resumptions and changes of the pace.
         missed_ticks: Deadlines that passed without a tick.
-        answer_wait: Seconds that a tick may wait for the command that answers the last tick.
+        answer_wait: Longest delay of a tick, s, while the answer to the last tick is missing.
     """
 
     def __init__(
@@ -53,7 +54,7 @@ class TickSchedule:
 
     @property
     def period(self) -> float:
-        """Seconds between ticks; 0 for as fast as possible."""
+        """Wall-clock seconds between ticks in real time; 0 for as fast as possible."""
         return self._tick_duration / self._factor if self._factor else 0.0
 
     @property
@@ -63,7 +64,7 @@ class TickSchedule:
 
     @property
     def asked_rate(self) -> float | None:
-        """Requested ticks per second of wall time; None in lockstep, paused or without a limit."""
+        """Requested ticks per wall-clock second; None in lockstep, paused or without a limit."""
         is_paced = self.period and self.mode == 'realtime' and not self.is_paused
         return 1.0 / self.period if is_paced else None
 
@@ -77,16 +78,13 @@ class TickSchedule:
         return max(0.0, due + (self.answer_wait if lacks_answer else 0.0) - now)
 
     def postpone(self, until: float) -> None:
-        """Move the deadline to `until`, because the tick waited for its command.
-
-        It moves by `answer_wait` at most.
-        """
+        """Move the deadline to `until`, by at most `answer_wait`, after a wait for a command."""
         self._due = min(max(self._due, until), self._due + self.answer_wait)
 
     def begin(self, now: float) -> None:
-        """Set the next deadline, because the due tick begins.
+        """Set the deadline of the next tick; call it when a tick begins.
 
-        Missed deadlines are counted and skipped: the robot never runs faster to catch up.
+        Missed deadlines are counted and skipped, so the robot never runs faster to catch up.
         """
         if self.mode != 'realtime' or self.is_paused:
             return
@@ -98,7 +96,7 @@ class TickSchedule:
             self._due += missed * self.period
 
     def set_paused(self, paused: bool, now: float) -> None:
-        """Pause, or resume without catching up."""
+        """Pause or resume; ticks of the pause are not caught up."""
         self.is_paused = paused
         self.changes += 1
         self.restart(now)
@@ -110,12 +108,12 @@ class TickSchedule:
         self.restart(now)
 
     def restart(self, now: float) -> None:
-        """Make the next tick due now, but not earlier than a period after the last one."""
+        """Make the next tick due now, but at least one period after the last tick."""
         self._due = max(now, self._began + self.period)
 
 
 class LatestTick:
-    """Publishes the newest tick while the topic has subscribers."""
+    """Publishes `latest_tick`, all messages of the newest tick in one, at a limited rate."""
 
     def __init__(
         self, output: Publisher, encoder: TickEncoder, clock: Callable[[], float] = time.monotonic
@@ -133,7 +131,7 @@ class LatestTick:
         self.publish_when_due()
 
     def repeat(self) -> None:
-        """Publish the last tick once more, for new subscribers."""
+        """Mark the last tick as unpublished, so that new subscribers receive it."""
         self._is_published = False
 
     def publish_when_due(self) -> None:

@@ -1,7 +1,7 @@
-"""The services of a simulator node: those of `std_srvs` and of `simulation_interfaces`.
+"""The services of a simulator node, with types of `std_srvs` and `simulation_interfaces`.
 
-`simulation_interfaces` is part of ROS and not on PyPI, so its requests and responses come from
-rclpy and its constants are repeated here: those of the releases 1.0.0 to 2.1.0. Jazzy has 1.5.1.
+The package `simulation_interfaces` is part of ROS but not on PyPI. So its constants are repeated
+here. They are the same in releases 1.0.0 to 2.1.0; Jazzy has 1.5.1.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def _callback(answer: Callable[[Any], Answer]) -> Callable[[Any, Any], Any]:
 
 
 class SimulationInterfaces:
-    """One method per service, with the signature of rclpy's service callbacks."""
+    """Callbacks of the `simulation_interfaces` services; each method is named like its service."""
 
     def __init__(self, robot: Robot, simulator_features: Any) -> None:
         self._robot = robot
@@ -81,7 +81,7 @@ class SimulationInterfaces:
         return response
 
     def get_simulation_state(self, request: Any, response: Any) -> Any:
-        """Return playing or paused; a robot in lockstep that waits for a command is playing."""
+        """Report the state playing or paused; waiting for a command counts as playing."""
         del request
         response.state.state = PAUSED if self._robot.schedule.is_paused else PLAYING
         return _finish(response, OK, '')
@@ -97,7 +97,7 @@ class SimulationInterfaces:
         return _finish(response, ALREADY_IN_TARGET_STATE if is_there else OK, answer.message)
 
     def reset_simulation(self, request: Any, response: Any) -> Any:
-        """End the episode (state) or restart the series (all); time never goes back."""
+        """End the episode for the scope `state`; start again at the first episode for `all`."""
         if request.scope not in (SCOPE_DEFAULT, SCOPE_STATE, SCOPE_ALL):
             line = f'scope {request.scope} given; allowed: {SCOPE_STATE} (state), '
             line += f'{SCOPE_DEFAULT} and {SCOPE_ALL} (all but time, which never goes back)'
