@@ -1,4 +1,4 @@
-"""A single `gymnasium.Env` on a `Simulation` with one copy."""
+"""The single environment: a `gymnasium.Env` that steps a `Simulation` with one copy."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ from msgs_spec.tasks import DEFAULT_CONTROL_HZ
 class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32]]):
     """One task with dictionary observations, for hindsight experience replay.
 
-    Episodes never terminate; `gymnasium.make` truncates them after the task's number of steps. Give
-    it the keyword arguments of this class. Copies by `pickle` or `copy` have their own physics and
-    continue from the same state, bit for bit.
+    Episodes never terminate; `gymnasium.make` truncates them after the task's number of steps.
+    `gymnasium.make` also takes the arguments of this class. Copies by `pickle` or `copy` have
+    their own physics and continue from the same state, bit for bit.
 
-    A subclass may override methods that Gymnasium-Robotics has, or a user may set them on the
+    A subclass may override these methods of Gymnasium-Robotics, or a user may set them on the
     object: `_sample_goal()`, `_get_obs()`, `_is_success(achieved_goal, desired_goal)`, and
     `compute_terminated`, `compute_truncated` and `compute_reward` (achieved_goal, desired_goal,
-    info). Resets and steps then call them, in the order of the reference.
+    info). `reset` and `step` then call them in the order of Gymnasium-Robotics.
 
-    Arguments are those of `TaskAttributes`.
+    The arguments are those of `TaskAttributes`.
 
     Raises:
         ValueError: If an argument is not allowed.
@@ -58,8 +58,9 @@ class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32
             options: `goal`, (goal size,): the desired goal, instead of a drawn one. As in
                 `Simulation.set_goal`, quaternions are normalised and moved to the hemisphere
                 nearest to the object's. All other draws follow from the seed.
-                `variation`, a dictionary: values of this episode in place of drawn ones, such as
-                `{'friction': 0.7}` (`Simulation.variation` has the names; needs `disturbances`).
+                `variation`, a dictionary: physics values of this episode in place of drawn ones,
+                such as `{'friction': 0.7}`. It needs `disturbances`; `Simulation.variation`
+                returns all names.
                 `start`, a dictionary: `joints`, `joint_velocities`, `object_pose` and
                 `object_velocity`, each optional, as `Simulation.reset` takes them.
 
@@ -95,10 +96,10 @@ class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32
         Returns:
             Observation, reward, terminated (always False), truncated (True if MuJoCo diverged; the
             observation is then the first of a new episode) and a dictionary with `is_success` and
-            `diverged`. Overridden methods may decide otherwise.
+            `diverged`. Overridden methods may return other values.
 
         Raises:
-            ValueError: If the action has a wrong shape, or a value is not a number (NaN).
+            ValueError: If the action has a wrong shape or contains NaN.
             gymnasium.error.ResetNeeded: If `reset` was never called.
         """
         given = np.asarray(action)
@@ -125,7 +126,7 @@ class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32
         return observation, float(reward), False, diverged, info
 
     def _evaluate(self, diverged: bool) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Return the result of a step from methods that may be overridden, as `robot_env.py`."""
+        """Return the result of a step, computed by the methods that a subclass may override."""
         observation = self._get_obs()
         goals = observation['achieved_goal'], self.goal
         info = {'is_success': self._is_success(*goals), 'diverged': diverged}
@@ -188,7 +189,7 @@ class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32
         return self.__dict__.copy()
 
     def _draws_goals(self) -> bool:
-        """Return whether the simulation draws goals, and tell it; False if `_sample_goal` does."""
+        """Return whether the simulation draws goals; an overridden `_sample_goal` disables this."""
         draws_goals = not self.overrides('_sample_goal')
         self.simulation.task.draws_goals = draws_goals
         return draws_goals
@@ -223,24 +224,24 @@ def _first(observation: Observation) -> Observation:
 
 
 class SharedPhysics:
-    """Live `env.unwrapped.model` and `env.unwrapped.data`, to read and to write.
+    """The MuJoCo model and data of an environment, which users may read and change.
 
-    Changes of model and data take effect in the next call. Nothing is copied before the first
-    access.
+    Changes take effect in the next call of the environment. Nothing is copied before a user first
+    reads `model` or `data`.
     """
 
     # The model when it was first shared, if its physics vary.
     _unchanged: bytes | None = None
 
     def __init__(self, simulation: Simulation) -> None:
-        """Share copy 0 of a simulation that was made with `keeps_data`."""
+        """Share simulation 0 of a `Simulation` that was created with `keeps_data=True`."""
         self._simulation = simulation
         self._data: mujoco.MjData | None = None
         self._shares_model = False
 
     @property
     def model(self) -> mujoco.MjModel:
-        """The compiled model, always the same object."""
+        """The compiled model; always the same object."""
         if not self._shares_model and self._simulation.varies_physics:
             self._unchanged = compiled_bytes(self._simulation.model)
         self._shares_model = True
@@ -248,7 +249,7 @@ class SharedPhysics:
 
     @property
     def data(self) -> mujoco.MjData:
-        """The state and what MuJoCo derived from it in its last pass, always the same object."""
+        """The state and the values that MuJoCo derived from it last; always the same object."""
         if self._data is None:
             self._data = mujoco.MjData(self._simulation.model)
             self.receive()
@@ -256,16 +257,16 @@ class SharedPhysics:
 
     @property
     def is_shared(self) -> bool:
-        """True if the model or the data was read before."""
+        """True once `model` or `data` was read."""
         return self._shares_model or self.shares_data
 
     @property
     def shares_data(self) -> bool:
-        """True if the data was read before."""
+        """True once `data` was read."""
         return self._data is not None
 
     def move_sites(self, sites: list[int], positions: Array) -> None:
-        """Move sites (n,) of the model to positions (n, 3), m; only pictures show these sites."""
+        """Move sites (n,), which only pictures use, to positions (n, 3) in their bodies, m."""
         is_unchanged = self._is_unchanged()
         self._simulation.model.site_pos[sites] = positions
         if is_unchanged:
@@ -277,17 +278,17 @@ class SharedPhysics:
         return self._unchanged == compiled_bytes(self._simulation.model)
 
     def send(self) -> None:
-        """Copy changes of `model` and `data` to the simulation, before a computation."""
+        """Copy changes of `model` and `data` to the simulation; call it before a computation."""
         if self._shares_model and not self._is_unchanged():
             self._simulation.apply_model_changes()
         if self._data is not None:
             self._simulation.write_data(0, self._data)
 
     def receive(self) -> None:
-        """Copy the state of the simulation into `data`, after a computation."""
+        """Copy the state of the simulation into `data`; call it after a computation."""
         if self._data is not None:
             self._simulation.read_data(0, self._data)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the state for `pickle` without `data`, which is read from the simulation again."""
+        """Return the state for `pickle` without `data`; a copy reads it from its simulation."""
         return self.__dict__ | {'_data': None}

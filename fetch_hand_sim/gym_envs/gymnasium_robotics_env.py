@@ -1,8 +1,8 @@
-"""The tasks as code written for Gymnasium-Robotics 1.4.2 expects them.
+"""Environments with the interface of Gymnasium-Robotics 1.4.2 ("the reference" in this module).
 
-Names, types and defaults are the reference's (`robot_env.py`, `fetch_env.py`, `reach.py`,
-`manipulate.py`). Subclasses may override its methods for goals, observations and the end of
-episodes. `docs/gymnasium_robotics.md` lists what is equal and what differs.
+Names, types and defaults are those of its `robot_env.py`, `fetch_env.py`, `reach.py` and
+`manipulate.py`. Subclasses may override the methods of the reference for goals, observations and
+the end of episodes. `docs/gymnasium_robotics.md` lists the differences.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def _is_ours(spec: gymnasium.envs.registration.EnvSpec) -> bool:
 
 @functools.cache
 def import_goal_env() -> Any:
-    """Return `gymnasium_robotics.core.GoalEnv`, or `gymnasium.Env` if it is not installed.
+    """Return the reference's class `GoalEnv`, or `gymnasium.Env` if it is not installed.
 
     Importing Gymnasium-Robotics registers its environments and prints a note. This function keeps
     the ids of this package and suppresses the note.
@@ -89,18 +89,18 @@ CAMERAS: dict[str, dict[str, Any]] = {
 
 
 def _pictures(task: str, camera: Mapping[str, Any] | None) -> dict[str, Any]:
-    """Return picture size and camera of the reference, with the changes `camera`."""
+    """Return the reference's arguments for pictures; `camera` replaces some camera attributes."""
     view = {**CAMERAS[task_spec(task).robot.name], **(camera or {})}
     return {'width': SIZE, 'height': SIZE, 'default_camera_config': view}
 
 
 def as_reference(reward: Any, reward_type: str) -> Any:
-    """Convert one reward or an array to the reference's type: float32 if sparse."""
+    """Return one reward or an array as float32 if rewards are sparse, else unchanged."""
     return reward.astype(np.float32) if reward_type == 'sparse' else reward
 
 
 class RobotEnv(FetchHandEnv, GoalEnv):
-    """Attributes of all Fetch and hand environments of the reference (`robot_env.py`).
+    """Base of the Fetch and hand environments, with the attributes of `robot_env.py`.
 
     Attributes:
         n_substeps: Physics steps per action.
@@ -127,7 +127,7 @@ class RobotEnv(FetchHandEnv, GoalEnv):
         default_camera_config: Mapping[str, Any] | None = None,
         **arguments: Any,
     ) -> None:
-        """Compile the model; arguments as `FetchHandEnv`."""
+        """Compile the model of a task; `arguments` are those of `FetchHandEnv`."""
         self._mujoco_renderer: Any = None
         pictures = _pictures(task, default_camera_config)
         self._camera = pictures['default_camera_config']
@@ -145,7 +145,7 @@ class RobotEnv(FetchHandEnv, GoalEnv):
         )
 
     def __setattr__(self, name: str, value: Any) -> None:
-        """Reject a new value for an attribute that states a fact about the task."""
+        """Set an attribute; reject new values of read-only attributes."""
         if name in self.__dict__.get('_stated', ()):
             raise AttributeError(
                 f'{name} of {self.spec_of_task.name} is fixed; for other values write a task of '
@@ -155,12 +155,12 @@ class RobotEnv(FetchHandEnv, GoalEnv):
 
     @property
     def stated(self) -> frozenset[str]:
-        """Names of the read-only attributes that state facts about the task."""
+        """Names of the read-only attributes."""
         own: frozenset[str] = self.__dict__['_stated']
         return own | {'has_object'}
 
     def _state(self, **facts: Any) -> None:
-        """Set facts about the task as read-only attributes; their arrays are read-only, too."""
+        """Set read-only attributes of the task; arrays among them become read-only, too."""
         stated: frozenset[str] = self.__dict__.get('_stated', frozenset())
         for fact in facts.values():
             for array in fact if isinstance(fact, tuple) else (fact,):
@@ -172,7 +172,7 @@ class RobotEnv(FetchHandEnv, GoalEnv):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Start an episode; options are ignored, as in the reference."""
+        """Start an episode; `options` is ignored, as in the reference."""
         started = super().reset(seed=seed)
         self._show_goal()
         return started
@@ -188,7 +188,7 @@ class RobotEnv(FetchHandEnv, GoalEnv):
         return observation, reward, terminated, truncated, info
 
     def compute_reward(self, achieved_goal: ArrayLike, goal: ArrayLike, info: Any = None) -> Any:
-        """Return rewards of goals of any batch shape: float32 if sparse, a scalar for one goal."""
+        """Return rewards (...) of goals (..., goal size); sparse rewards are float32."""
         reward = super().compute_reward(achieved_goal, goal, info)[()]
         return as_reference(reward, self.reward_type)
 
@@ -198,10 +198,10 @@ class RobotEnv(FetchHandEnv, GoalEnv):
         return self.spec_of_task.has_object
 
     def render(self) -> Image | None:
-        """Return a picture, as `FetchHandEnv.render`, after a call of `_render_callback`.
+        """Call `_render_callback` and return a picture, as `FetchHandEnv.render` does.
 
-        Gymnasium's renderer draws it, with its cameras and markers, once `mujoco_renderer` was read
-        or if `_render_callback` is overridden.
+        Gymnasium's renderer draws the picture, with its cameras and markers, if `_render_callback`
+        is overridden or after the first read of `mujoco_renderer`.
         """
         if self.render_mode is None:
             return None
@@ -222,7 +222,7 @@ class RobotEnv(FetchHandEnv, GoalEnv):
 
     @property
     def mujoco_renderer(self) -> Any:
-        """Gymnasium's `MujocoRenderer` for `model` and `data`."""
+        """Gymnasium's `MujocoRenderer` for `model` and `data`, created at the first read."""
         if self._mujoco_renderer is None:
             size = self.width, self.height
             self._mujoco_renderer = mujoco_renderer(self.model, self.data, self._camera, *size)
@@ -256,12 +256,12 @@ class RobotEnv(FetchHandEnv, GoalEnv):
         return super().__getstate__() | {'_mujoco_renderer': None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Restore the state; make the arrays of facts read-only again."""
+        """Restore the state; make the arrays of read-only attributes read-only again."""
         self.__dict__.update(state)
         self._state(**{name: state[name] for name in state['_stated']})
 
     def _render_callback(self) -> None:
-        """Move the goal in `model` and `data`, so that forward passes keep it there."""
+        """Show the goal in `model` and `data` if the user has read one of them."""
         if self._physics.is_shared:
             self._show_goal()
             self._keep_goal()
@@ -271,7 +271,7 @@ class RobotEnv(FetchHandEnv, GoalEnv):
             self._draw_goal(self._physics.data)
 
     def _draw_goal(self, data: Any) -> None:
-        """Move the target sites to the goal; they do not change the physics."""
+        """Move the target sites to the goal; these sites do not affect the physics."""
         data.site_xpos[self._target_sites] = self.goal.reshape(-1, 3)
 
     def _keep_goal(self) -> None:
@@ -288,7 +288,7 @@ class RobotEnv(FetchHandEnv, GoalEnv):
 
 
 class FetchEnv(RobotEnv):
-    """`fetch_env.py`: FetchReach, FetchPush, FetchSlide, FetchPickAndPlace.
+    """FetchReach, FetchPush, FetchSlide and FetchPickAndPlace, with the names of `fetch_env.py`.
 
     Attributes:
         initial_gripper_xpos: (3,) start position of the gripper, m.
@@ -296,13 +296,13 @@ class FetchEnv(RobotEnv):
         gripper_extra_height: Added to the start height of the gripper, m.
         block_gripper: Whether the fingers are locked shut.
         target_in_the_air: Whether goals may be above the table.
-        target_offset: Added to goals, (3,) m, or 0.
+        target_offset: Added to goals: (3,) m, or the number 0 if there is no offset.
         obj_range: Half width of the square in which the object starts, m.
         target_range: Half width of the cube in which goals lie, m.
     """
 
     def __init__(self, task: str, **arguments: Any) -> None:
-        """Compile the model; arguments as `FetchHandEnv`."""
+        """Compile the model of a task; `arguments` are those of `FetchHandEnv`."""
         super().__init__(task, **arguments)
         physics = self.simulation.task
         assert isinstance(physics, FetchTask)
@@ -325,7 +325,7 @@ class FetchEnv(RobotEnv):
 
 
 class HandReachEnv(RobotEnv):
-    """`shadow_dexterous_hand/reach.py`.
+    """HandReach, with the names of `shadow_dexterous_hand/reach.py`.
 
     Attributes:
         initial_goal: (15,) fingertip positions in the initial pose, m.
@@ -334,7 +334,7 @@ class HandReachEnv(RobotEnv):
     """
 
     def __init__(self, task: str = 'HandReach', **arguments: Any) -> None:
-        """Compile the model; arguments as `FetchHandEnv`."""
+        """Compile the model of a task; `arguments` are those of `FetchHandEnv`."""
         super().__init__(task, **arguments)
         physics = self.simulation.task
         assert isinstance(physics, HandReachTask)
@@ -351,7 +351,7 @@ class HandReachEnv(RobotEnv):
 
 
 class ManipulateEnv(RobotEnv):
-    """`shadow_dexterous_hand/manipulate.py`: block, egg and pen.
+    """The tasks with block, egg and pen, with the names of `shadow_dexterous_hand/manipulate.py`.
 
     Args:
         target_position: `random` or `ignore`; None for the task's own.
@@ -368,7 +368,7 @@ class ManipulateEnv(RobotEnv):
         relative_control: Always False.
 
     Raises:
-        ValueError: If no task has such goals for this object; the message lists those that exist.
+        ValueError: If no task with this object has such goals; the message lists the allowed ones.
     """
 
     def __init__(
@@ -396,14 +396,14 @@ class ManipulateEnv(RobotEnv):
         )
 
     def compute_reward(self, achieved_goal: ArrayLike, goal: ArrayLike, info: Any = None) -> Any:
-        """Return rewards as `RobotEnv`; sparse ones call an overridden `_is_success`."""
+        """Return rewards as `RobotEnv` does; sparse rewards follow an overridden `_is_success`."""
         if self.reward_type == 'sparse' and self.overrides('_is_success'):
             success = np.asarray(self._is_success(achieved_goal, goal), dtype=np.float32)
             return (success - np.float32(1.0))[()]
         return super().compute_reward(achieved_goal, goal, info)
 
     def _draw_goal(self, data: Any) -> None:
-        """Move the target body to the goal; it does not change the physics."""
+        """Move the target geom to the goal; this geom does not affect the physics."""
         pose = self._shown_goal()
         geom = self._target_geom
         data.geom_xpos[geom] = pose[:3]
@@ -414,7 +414,7 @@ class ManipulateEnv(RobotEnv):
         mujoco_utils().set_joint_qvel(self.model, self.data, 'target:joint', np.zeros(6))
 
     def _shown_goal(self) -> Array:
-        """Return the goal pose to draw: beside the hand if the position is ignored."""
+        """Return the goal pose (7,) to draw, beside the hand if its position does not count."""
         goal = self.goal.copy()
         if not self.spec_of_task.position_counts:
             goal[0] += 0.15
@@ -439,7 +439,7 @@ make_env.metadata = RobotEnv.metadata  # type: ignore[attr-defined]
 
 
 def _sites(model: mujoco.MjModel, prefix: str) -> list[int]:
-    """Return the sites `<prefix>0`, `<prefix>1`, ... of a model."""
+    """Return the indices of the sites `<prefix>0`, `<prefix>1`, ... of a model."""
     found = (find(model, mujoco.mjtObj.mjOBJ_SITE, f'{prefix}{i}') for i in itertools.count())
     return list(itertools.takewhile(lambda site: site >= 0, found))
 
@@ -451,7 +451,7 @@ def _goal_kind(task: str) -> tuple[str, str]:
 
 
 def task_with_goals(task: str, position: str | None, rotation: str | None) -> str:
-    """Return the task with the same object and this kind of goals; None keeps the task's own."""
+    """Return the name of the task with the same object and these goals; None keeps a setting."""
     one_of(task, list(MANIPULATE_CONFIGS), 'task')
     own, asset = _goal_kind(task), MANIPULATE_CONFIGS[task].asset
     wanted = (position or own[0], rotation or own[1])
@@ -469,7 +469,7 @@ def task_with_goals(task: str, position: str | None, rotation: str | None) -> st
 
 
 class GymnasiumRoboticsVectorEnv(FetchHandVectorEnv):
-    """N copies of a Gymnasium-Robotics task, with the results of a `SyncVectorEnv` of them."""
+    """N copies of a task with the results of `SyncVectorEnv` and Gymnasium-Robotics."""
 
     def __init__(
         self,
@@ -493,7 +493,7 @@ class GymnasiumRoboticsVectorEnv(FetchHandVectorEnv):
         seed: int | Sequence[int | None] | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[Observation, dict[str, Any]]:
-        """Start episodes; options except `reset_mask` are ignored, as in the reference."""
+        """Start episodes; `options` other than `reset_mask` are ignored, as in the reference."""
         known = None
         if isinstance(options, dict) and 'reset_mask' in options:
             known = {'reset_mask': options['reset_mask']}
@@ -502,7 +502,7 @@ class GymnasiumRoboticsVectorEnv(FetchHandVectorEnv):
     def step(
         self, actions: NDArray[np.float32]
     ) -> tuple[Observation, Array, Flags, Flags, dict[str, Any]]:
-        """Advance as `FetchHandVectorEnv`; `is_success` is float32, as in the reference."""
+        """Step as `FetchHandVectorEnv` does; `is_success` is float32, as in the reference."""
         observation, reward, terminated, truncated, info = super().step(actions)
         for each in (info, info.get('final_info', {})):
             if 'is_success' in each:
@@ -510,12 +510,12 @@ class GymnasiumRoboticsVectorEnv(FetchHandVectorEnv):
         return observation, reward, terminated, truncated, info
 
     def compute_reward(self, achieved_goal: ArrayLike, goal: ArrayLike, info: Any = None) -> Any:
-        """Return rewards of goals of any batch shape: float32 if sparse, a scalar for one goal."""
+        """Return rewards (...) of goals (..., goal size); sparse rewards are float32."""
         reward = super().compute_reward(achieved_goal, goal, info)[()]
         return as_reference(reward, self.reward_type)
 
     def attributes(self, name: str) -> tuple[Any, ...]:
-        """Return an attribute of every environment, also facts such as `initial_qpos`."""
+        """Return an attribute of every environment, including those of `RobotEnv`."""
         try:
             return super().attributes(name)
         except AttributeError:
@@ -525,7 +525,7 @@ class GymnasiumRoboticsVectorEnv(FetchHandVectorEnv):
 
     @cached_property
     def _single(self) -> RobotEnv:
-        """A single environment, which has the facts that all share; made at first use."""
+        """A single environment, from which the batch reads attributes such as `initial_qpos`."""
         return make_env(self.spec_of_task.name, control_hz=self.simulation.control_hz)
 
 
@@ -533,11 +533,12 @@ class GymnasiumRoboticsVectorEnv(FetchHandVectorEnv):
 
 
 def mujoco_utils() -> Any:
-    """Return the names of `gymnasium_robotics.utils.mujoco_utils` with working joint functions.
+    """Return `gymnasium_robotics.utils.mujoco_utils` with corrected joint functions.
 
-    Its own fail with MuJoCo 3.12 and later, where `model.jnt_type[i] == mjtJoint.mjJNT_HINGE` is
-    False for every hinge and slide joint. `get_joint_qpos` returns (1,) rad or m, (4,) of a ball,
-    (7,) of a free joint; `get_joint_qvel` (1,), (3,), (6,) per second; the setters take the same.
+    The original functions fail with MuJoCo 3.12 and later, where `model.jnt_type[i] ==
+    mjtJoint.mjJNT_HINGE` is False for every hinge joint. For hinge or slide, ball and free joints,
+    `get_joint_qpos` returns (1,), (4,) and (7,) values, and `get_joint_qvel` (1,), (3,) and (6,).
+    `set_joint_qpos` and `set_joint_qvel` take values of these shapes.
     """
     from gymnasium_robotics.utils import mujoco_utils as reference
 
@@ -561,7 +562,7 @@ def _set_joint(
 def robot_get_obs(
     model: mujoco.MjModel, data: mujoco.MjData, joint_names: Sequence[str]
 ) -> tuple[Array, Array]:
-    """Return positions and velocities of the joints whose names begin with `robot`."""
+    """Return positions and velocities, (n,) each, of the n joints that begin with `robot`."""
     names = [name for name in joint_names if name.startswith('robot')]
     qpos, qvel = (
         np.squeeze(np.array([_get_joint(kind, model, data, name) for name in names]))
@@ -577,7 +578,7 @@ def mujoco_renderer(
     width: int,
     height: int,
 ) -> Any:
-    """Return Gymnasium's `MujocoRenderer`, which also draws without a display."""
+    """Return Gymnasium's `MujocoRenderer`, changed to work without a display."""
     from gymnasium.envs.mujoco.mujoco_rendering import MujocoRenderer
 
     class Renderer(MujocoRenderer):
@@ -602,13 +603,13 @@ def mujoco_renderer(
 
 
 def depth_in_metres(model: mujoco.MjModel, depth: Any) -> Any:
-    """Return distances from the camera plane, m, of an OpenGL depth buffer in [0, 1]."""
+    """Convert an OpenGL depth buffer, values in [0, 1], to distances from the camera plane, m."""
     near, far = (plane * model.stat.extent for plane in (model.vis.map.znear, model.vis.map.zfar))
     return (near / (1.0 - depth * (1.0 - near / far))).astype(np.float32)
 
 
 def _joint_values(model: mujoco.MjModel, data: mujoco.MjData, name: str, kind: str) -> Any:
-    """Return the entries of `qpos` or `qvel` that belong to a joint, live."""
+    """Return a view of a joint's entries in `data`; `kind` is `qpos` or `qvel`."""
     if find(model, mujoco.mjtObj.mjOBJ_JOINT, name) < 0:
         raise ValueError(f'the model has no joint {name!r}')
     return getattr(data.joint(name), kind)

@@ -1,4 +1,4 @@
-"""The results of `render`, for every render mode."""
+"""Draw the pictures that `render` of the environments returns or shows."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ RENDER_MODES = ['human', 'rgb_array', 'depth_array']
 class Pictures:
     """Renders copies of a simulation; opens OpenGL or a window at the first picture.
 
-    An invalid size (pixels) or attribute of the camera raises ValueError, missing OpenGL or, for
-    `human`, a missing display RuntimeError.
+    The constructor raises ValueError for an invalid size (pixels) or camera attribute. `render`
+    raises RuntimeError if OpenGL is missing or, in mode `human`, if the display is missing.
     """
 
     def __init__(
@@ -53,7 +53,7 @@ class Pictures:
         self._window: Any = None
 
     def render(self, mode: str, index: int = 0) -> Image | None:
-        """Render one copy.
+        """Render copy `index` of the simulation.
 
         Returns:
             `rgb_array`: (height, width, 3). `depth_array`: (height, width), metres. `human`: None.
@@ -80,11 +80,11 @@ class Pictures:
         self._renderer = self._window = None
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the state for `pickle`, without OpenGL, which the copy opens again."""
+        """Return the state for `pickle` without OpenGL objects; a copy opens its own."""
         return self.__dict__ | {'_scene': None, '_renderer': None, '_window': None}
 
     def _show(self, scene: Scene, frame: Frame) -> None:
-        """Draw a frame in Gymnasium's window, opened at first use."""
+        """Draw a frame in Gymnasium's window; the first call opens the window."""
         if self._window is None:
             self._window = _open_window(scene, *self._size)
             self._window.cam = make_camera(scene, self._camera)
@@ -102,7 +102,7 @@ class Pictures:
 
 
 def _open_window(scene: Scene, width: int, height: int) -> Any:
-    """Open a window on a scene; raise RuntimeError without a display."""
+    """Return a new window that shows a scene; raise RuntimeError without a display."""
     try:
         from gymnasium.envs.mujoco.mujoco_rendering import WindowViewer
 

@@ -1,4 +1,4 @@
-"""Register the tasks with Gymnasium: `fetch_hand_sim/<Task>-v0`, and the reference's ids."""
+"""Register the ids `fetch_hand_sim/<Task>-v0` and those of Gymnasium-Robotics with Gymnasium."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ def environment_id(task: str) -> str:
 
 
 def register_environments() -> None:
-    """Register the missing ids; import nothing slow, such as MuJoCo."""
+    """Register the tasks that are not yet registered, without importing MuJoCo."""
     for task in TASKS:
         if environment_id(task) not in gymnasium.registry:
             _register(environment_id(task), _ENV, _VECTOR_ENV, task=task)
 
 
 def _register(name: str, entry_point: str, vector_entry_point: str, **arguments: str) -> None:
-    """Register an id with a single and a vector environment and their common arguments."""
+    """Register the classes of a single and a vector environment, with `arguments`, under an id."""
     gymnasium.register(
         name,
         entry_point=entry_point,
@@ -49,15 +49,15 @@ def _register(name: str, entry_point: str, vector_entry_point: str, **arguments:
 
 
 def make(name: str | EnvSpec, **arguments: Any) -> gymnasium.Env[Any, Any]:
-    """Call `gymnasium.make` so that episodes last as many seconds at every `control_hz`.
+    """Make an environment whose episodes have the same duration at every `control_hz`.
 
-    `gymnasium.make` itself ends episodes after the number of steps for 25 Hz, unless it is given
-    `max_episode_steps`.
+    `gymnasium.make` itself ends episodes after the number of steps for 25 Hz, unless the user
+    passes `max_episode_steps`.
 
     Args:
-        name: The task (`FetchPush`; `msgs_spec.tasks.TASKS` has all), the id, or `spec` of an
-            environment.
-        **arguments: Those of `gymnasium.make` and `FetchHandEnv`, such as `reward_type`,
+        name: A task of `msgs_spec.tasks.TASKS` such as `FetchPush`, a Gymnasium id, or the
+            `spec` of an environment.
+        **arguments: Arguments of `gymnasium.make` and `FetchHandEnv`, such as `reward_type`,
             `render_mode` and `control_hz`.
 
     Raises:
@@ -106,7 +106,7 @@ def _with_length(name: str | EnvSpec, arguments: dict[str, Any]) -> dict[str, An
 
 
 def _spec_of(name: str) -> EnvSpec:
-    """Return the spec of an id in the form of `gymnasium.make`: [module:]id[-v...]."""
+    """Return the spec of an id `[module:]id[-v...]`, the form that `gymnasium.make` accepts."""
     module, _, short = name.rpartition(':')
     if module:
         import_module(module)
@@ -122,19 +122,18 @@ def make_vec(
     wrappers: Sequence[Callable[[Any], VectorEnv[Any, Any, Any]]] | None = None,
     **arguments: Any,
 ) -> VectorEnv[Any, Any, Any]:
-    """Make a vector environment as `gymnasium.make_vec`, but also with wrappers.
+    """Make a vector environment like `gymnasium.make_vec`, with optional wrappers.
 
-    Episodes last as many seconds at every `control_hz`, as with `make`.
+    Episodes have the same duration at every `control_hz`, as with `make`.
 
     Args:
-        name: The task, the id, or `spec` of an environment.
-        wrappers: Wrappers of the batch, the innermost first: those of
-            `gymnasium.wrappers.vector`, or those of single environments that exist there by the
-            same name.
-        **arguments: Those of `FetchHandVectorEnv`.
+        name: As in `make`.
+        wrappers: Wrappers of the vector environment, the innermost first. A wrapper of single
+            environments is replaced by the one of the same name in `gymnasium.wrappers.vector`.
+        **arguments: Arguments of `FetchHandVectorEnv`.
 
     Raises:
-        ValueError: If a wrapper is for single environments only, or an argument is not allowed.
+        ValueError: If a wrapper exists for single environments only, or an argument is not allowed.
         gymnasium.error.NameNotFound: If there is no such task or id.
     """
     name = _id_of(name)
@@ -187,15 +186,15 @@ _REFERENCE_VECTOR_ENV = 'fetch_hand_sim.gym_envs.gymnasium_robotics_env:Gymnasiu
 def register_gymnasium_robotics(override: bool = False) -> None:
     """Register the ids of Gymnasium-Robotics 1.4.2: `FetchPush-v4`, `HandReachDense-v3`, ...
 
-    Code written for them then runs on this package, without another change.
+    Code written for Gymnasium-Robotics then runs on this package without another change.
 
     Args:
-        override: Whether ids that Gymnasium-Robotics itself has registered are replaced. It is
-            imported first then, so that importing it later changes nothing.
+        override: Whether to replace ids that another package has registered. If True, this
+            function first imports Gymnasium-Robotics, so that a later import changes nothing.
 
     Raises:
-        gymnasium.error.Error: If it has registered them and override is False; nothing is
-            registered then.
+        gymnasium.error.Error: If another package has registered one of the ids and `override` is
+            False. No id is registered then.
     """
     if override:
         from fetch_hand_sim.gym_envs.gymnasium_robotics_env import import_goal_env
@@ -215,9 +214,9 @@ def register_gymnasium_robotics(override: bool = False) -> None:
 
 
 def reference_ids() -> dict[str, tuple[str, str]]:
-    """Return task and reward type by id, for the ids of the reference with the same physics.
+    """Return (task, reward type) for each id of Gymnasium-Robotics that has the same physics.
 
-    Its other versions (Fetch -v1, HandReach -v0, HandManipulate* -v0) need mujoco-py.
+    Older versions (Fetch -v1, HandReach -v0, HandManipulate* -v0) need mujoco-py and are left out.
     """
     ids = {}
     for task, spec in TASKS.items():

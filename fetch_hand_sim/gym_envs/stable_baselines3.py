@@ -1,4 +1,4 @@
-"""The batch as a `VecEnv` of Stable-Baselines3; needs `pip install 'fetch_hand_sim[sb3]'`."""
+"""A `VecEnv` for Stable-Baselines3; needs `pip install 'fetch_hand_sim[sb3]'`."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class FetchHandVecEnv(VecEnv):
     `VecMonitor` for the returns of episodes.
 
     Args:
-        **arguments: Those of `FetchHandVectorEnv` except `autoreset_mode`.
+        **arguments: Arguments of `FetchHandVectorEnv` except `autoreset_mode`.
     """
 
     def __init__(self, task: str, num_envs: int = 1, **arguments: Any) -> None:
@@ -42,10 +42,10 @@ class FetchHandVecEnv(VecEnv):
     def reset(self) -> Observation:
         """Start all episodes, with the seeds and options that `seed` and `set_options` set.
 
-        Options are `goal`, `variation` and `start`, as `FetchHandEnv.reset` takes them.
+        Options are `goal`, `variation` and `start`, as in `FetchHandEnv.reset`.
 
         Raises:
-            ValueError: If an option is unknown or impossible. All options are forgotten then.
+            ValueError: If an option is unknown or invalid. All options are cleared then.
         """
         options = self._options
         self._reset_options()
@@ -87,12 +87,12 @@ class FetchHandVecEnv(VecEnv):
         return self.batch.render() or [None] * self.num_envs
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """Return an attribute of the environments; a method is returned, not called."""
+        """Return an attribute of each environment in `indices`; methods are not called."""
         values = self.batch.attributes(attr_name)
         return [values[i] for i in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """Set `goal` of some environments, or an attribute that all share."""
+        """Set `goal` of the environments in `indices`, or an attribute that all share."""
         values = list(self.batch.attributes(attr_name))
         for index in self._get_indices(indices):
             values[index] = value
@@ -105,10 +105,10 @@ class FetchHandVecEnv(VecEnv):
         indices: VecEnvIndices = None,
         **method_kwargs: Any,
     ) -> list[Any]:
-        """Call a method of the environments; return the results."""
+        """Call a method of the environments; return the result of each one in `indices`."""
         results = self.batch.call(method_name, *method_args, **method_kwargs)
         return [results[i] for i in self._get_indices(indices)]
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: VecEnvIndices = None) -> list[bool]:
-        """Return False for each: single environments of a batch have no wrappers."""
+        """Return False for each environment: members of a batch have no wrappers."""
         return [False for _ in self._get_indices(indices)]

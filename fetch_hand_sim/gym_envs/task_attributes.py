@@ -1,4 +1,4 @@
-"""Common parts of the single and the vector environment: arguments, spaces, settings."""
+"""Common parts of the single and the vector environment: arguments, spaces and settings."""
 
 from __future__ import annotations
 
@@ -29,22 +29,23 @@ RESET_OPTIONS = ('goal', 'variation', 'start')
 
 
 class TaskAttributes:
-    """Rewards for any goals, and settings that may be changed between steps.
+    """Base of the environments: rewards for any goals, and settings that users may change.
 
     Args:
         task: One of the tasks (`msgs_spec.tasks.TASKS`).
         reward_type: `sparse` (-1 or 0) or `dense` (minus the distance).
-        success_rule: `gymnasium` (released code) or `paper` (its text).
-        control_hz: Actions per simulated second: 500/n for n = 1 ... 40. For other rates than 25 Hz
-            use `fetch_hand_sim.make`: Gymnasium would end episodes after the steps for 25 Hz.
+        success_rule: `gymnasium` (as in the released code) or `paper` (as in the text of Plappert
+            et al. 2018).
+        control_hz: Actions per simulated second: 500/n for n = 1 ... 40. For rates other than 25 Hz
+            use `fetch_hand_sim.make`, which keeps the duration of episodes.
         render_mode: One of `metadata['render_modes']` or None.
         width: Pixels of a picture.
         height: Pixels of a picture.
         default_camera_config: Attributes of `mujoco.MjvCamera`, such as `distance` (m),
             `azimuth`, `elevation` (degrees) and `lookat` (m); None for the task's view.
-        distance_threshold: Success within this distance, metres; None for the task's own.
-        rotation_threshold: Success within this rotation, radians; None for the task's own.
-        disturbances: Delays, noise, other physics: a preset (`hardware`, `hardware*0.5`), a
+        distance_threshold: Success threshold of the distance, m; None for the task's own.
+        rotation_threshold: Success threshold of the rotation, rad; None for the task's own.
+        disturbances: Delays, noise and changed physics: a preset (`hardware`, `hardware*0.5`), a
             mapping, a JSON or YAML file or `Disturbances`; None for an undisturbed robot.
         **batch: Further arguments of `Simulation`, for subclasses.
 
@@ -103,13 +104,13 @@ class TaskAttributes:
             self.rotation_threshold = rotation_threshold
 
     def __setattr__(self, name: str, value: Any) -> None:
-        """Reject a method that nothing calls."""
+        """Set an attribute; reject methods of other environments that this one never calls."""
         if name in self._uncalled:
             raise TypeError(f'{name} would have no effect here; {self._hint}')
         super().__setattr__(name, value)
 
     def __copy__(self) -> Self:
-        """Return `copy.deepcopy`, so that copies share neither physics nor random generators."""
+        """Return a deep copy, so that copies share neither physics nor random generators."""
         return copy.deepcopy(self)
 
     @property
@@ -133,22 +134,19 @@ class TaskAttributes:
     ) -> Any:
         """Return rewards (...) of goals of any batch shape (..., goal size).
 
-        If a subclass overrides it, steps use its rewards.
+        If a subclass overrides this method, `step` returns its rewards.
         """
         return self.simulation.compute_reward(achieved_goal, desired_goal, info)
 
     def overrides(self, name: str) -> bool:
-        """True if a subclass or the user has replaced the method `name`.
-
-        Steps and resets then call it, as those of Gymnasium-Robotics do.
-        """
+        """Return whether a subclass or the user has replaced the method `name`."""
         module = getattr(getattr(type(self), name), '__module__', '')
         return name in self.__dict__ or not module.startswith('fetch_hand_sim.')
 
     def compute_terminated(
         self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any
     ) -> Any:
-        """Return False: tasks have no terminal state; a subclass may override this."""
+        """Return False, because tasks have no terminal state; a subclass may override this."""
         return False
 
     def compute_truncated(
@@ -181,7 +179,7 @@ class TaskAttributes:
 
     @property
     def distance_threshold(self) -> float:
-        """Success within this distance, metres."""
+        """Success threshold of the distance to the goal, m."""
         return self.simulation.metric.spec.distance_threshold
 
     @distance_threshold.setter
@@ -190,7 +188,7 @@ class TaskAttributes:
 
     @property
     def rotation_threshold(self) -> float | None:
-        """Success within this rotation, radians; None where rotations do not count."""
+        """Success threshold of the rotation to the goal, rad; None if rotations do not count."""
         return self.simulation.metric.spec.rotation_threshold
 
     @rotation_threshold.setter
@@ -211,12 +209,12 @@ class TaskAttributes:
     def _read_options(
         self, options: Any, mask: NDArray[np.bool_], *others: str
     ) -> dict[str, list[Any]]:
-        """Return goal, variation and start, as `Simulation.reset` takes them, or raise ValueError.
+        """Return `goal`, `variation` and `start` for `Simulation.reset`, or raise ValueError.
 
         Args:
-            options: A dictionary or None. Each of the three is one for all, or a list of N.
-            mask: (N,) which environments start.
-            others: Names of further options.
+            options: A dictionary or None. Each option is one value for all, or a list of N.
+            mask: (N,) True for the environments that start; the results contain only these.
+            others: Names of further allowed options, which the caller reads.
         """
         given = entries('options', {} if options is None else options, (*RESET_OPTIONS, *others))
         return {
@@ -226,7 +224,7 @@ class TaskAttributes:
 
 
 def observation_space(spec: TaskSpec) -> spaces.Space[Any]:
-    """Return the unbounded space of `observation`, `achieved_goal`, `desired_goal`, float64."""
+    """Return the unbounded float64 space of observations, a dictionary of three parts."""
     sizes = {'observation': spec.observation_size}
     sizes |= dict.fromkeys(('achieved_goal', 'desired_goal'), spec.goal.size)
     return spaces.Dict(

@@ -1,4 +1,4 @@
-"""A `gymnasium.vector.VectorEnv` on a `Simulation` with any number of copies."""
+"""The vector environment: a `gymnasium.vector.VectorEnv` that steps N copies of a task."""
 
 from __future__ import annotations
 
@@ -36,16 +36,16 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
     `info['final_obs']` is its last observation. `DISABLED`: only `reset_mask` starts episodes.
     `pickle` and `copy.deepcopy` keep the state.
 
-    Subclasses may override `compute_reward`, `compute_terminated` and `compute_truncated` of
-    (achieved_goal, desired_goal, info) for all N at once: goals (N, goal size), results (N,).
-    Other methods that subclasses of `FetchHandEnv` may override raise TypeError. Further arguments
-    are those of `TaskAttributes`; for other rates than 25 Hz use `fetch_hand_sim.make_vec`.
+    Subclasses may override `compute_reward`, `compute_terminated` and `compute_truncated`. These
+    methods take (achieved_goal, desired_goal, info) of all N environments, goals (N, goal size),
+    and return (N,). Further arguments are those of `TaskAttributes`; for rates other than 25 Hz
+    use `fetch_hand_sim.make_vec`.
 
     Args:
         task: One of the tasks (`msgs_spec.tasks.TASKS`).
         num_envs: Number of copies N.
         max_episode_steps: Steps per episode; None for the task's own number, -1 for no limit.
-        num_threads: Threads that step them; 0 for all processors that the process may use.
+        num_threads: Threads that step the copies; 0 for all processors that the process may use.
         autoreset_mode: When the next episode starts; see above.
         disable_env_checker: Ignored; `gymnasium.make_vec` passes it to batches too.
 
@@ -104,11 +104,11 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
         """Start episodes.
 
         Args:
-            seed: One seed (environment i takes seed + i), one per environment, or None: the random
-                generators continue.
-            options: `reset_mask`, booleans (N,): which environments start again; default all.
+            seed: One seed (environment i takes seed + i), one per environment, or None to continue
+                the random generators.
+            options: `reset_mask`, booleans (N,): the environments to start; all by default.
                 `goal`, `variation` and `start` as in `FetchHandEnv.reset`: one for all, or one for
-                each of N, where None means that it is drawn.
+                each of N, where None means a random value.
 
         Returns:
             The observations of all environments, in the order of the space, and an empty
@@ -139,18 +139,20 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
     def step(
         self, actions: NDArray[np.float32]
     ) -> tuple[Observation, Array, Flags, Flags, dict[str, Any]]:
-        """Advance every environment by one tick, or start it again if its episode had ended.
+        """Advance all environments by one step.
+
+        In mode `NEXT_STEP`, environments whose episode has ended start the next one instead.
 
         Args:
             actions: (N, action size), clipped to [-1, 1]; infinite values, too.
 
         Returns:
             Observations (N, ...), rewards (N,), terminated (N,), truncated (N,) and a dictionary.
-            Terminated is False unless a subclass overrides it. Truncated is True at the last step
-            and if MuJoCo diverged. The dictionary has `is_success` and `diverged` (N,); the masks
-            `_is_success` and `_diverged` are False where an episode only started. In mode
-            `SAME_STEP` it also has `final_obs` (N,), a dictionary for each ended episode, and
-            `final_info`.
+            Terminated is False unless a subclass overrides `compute_terminated`. Truncated is True
+            at the last step and if MuJoCo diverged. The dictionary has `is_success` and `diverged`
+            (N,); the masks `_is_success` and `_diverged` are False where this step started an
+            episode. In mode `SAME_STEP` the dictionary also has `final_obs` (N,), a dictionary for
+            each ended episode, and `final_info`.
 
         Raises:
             ValueError: If the actions have a wrong shape, a value is NaN, or a subclass ends
@@ -193,7 +195,7 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
         return self.simulation.generator(index).bit_generator
 
     def _ordered(self, observation: Observation) -> Observation:
-        """Sort the parts of an observation as the space does, as Gymnasium's batches are."""
+        """Return the observation with its parts sorted by name, the order of the space."""
         return {name: observation[name] for name in sorted(observation)}
 
     def _rewards(self, result: StepResult) -> Array:
@@ -203,7 +205,7 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
         return np.asarray(self.compute_reward(*_evaluated(result)), dtype=np.float64)
 
     def _endings(self, name: str, result: StepResult) -> Flags:
-        """Return which episodes an overridden method ends, (N,)."""
+        """Return flags (N,) of the episodes that the method `name`, if overridden, ends."""
         if not self.overrides(name):
             return np.zeros(self.num_envs, dtype=bool)
         ends = getattr(self, name)(*_evaluated(result))
@@ -218,7 +220,7 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
     def _start_next(
         self, last: Observation, info: dict[str, Any], ended: Flags
     ) -> tuple[Observation, dict[str, Any]]:
-        """Start the next episodes; return the last observations of the ended ones as well."""
+        """Start the next episodes; return their observation, and info with `final_obs`."""
         final = np.full(self.num_envs, None, dtype=object)
         for index in np.flatnonzero(ended).tolist():
             final[index] = {name: rows[index] for name, rows in last.items()}
@@ -269,7 +271,7 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
 
         Raises:
             AttributeError: If an environment has no such attribute.
-            ValueError: For `reset`, `step` and `close`, which act on all environments only.
+            ValueError: For `reset`, `step` and `close`; call these directly.
         """
         if name in _FOR_ALL:
             raise ValueError(f'{name} is for all environments of a batch; use it directly')
@@ -287,7 +289,7 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
         return (getattr(self, _SHARED.get(name, name)),) * self.num_envs
 
     def get_attr(self, name: str) -> tuple[Any, ...]:
-        """Return an attribute of every environment."""
+        """Return an attribute, or the result of a method, of every environment."""
         return self.call(name)
 
     def set_attr(self, name: str, values: Any) -> None:
@@ -323,7 +325,7 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
         self._pictures.close()
 
     def _each_seed(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
-        """Return the seed of each environment; None continues its random generator."""
+        """Return a seed for each environment; None continues the random generator."""
         if seed is None:
             each: list[int | None] = [None] * self.num_envs
         elif np.ndim(seed):  # type: ignore[arg-type]
@@ -367,16 +369,16 @@ _SHARED = {'action_space': 'single_action_space', 'observation_space': 'single_o
 
 
 def _evaluated(result: StepResult) -> tuple[Array, Array, dict[str, Any]]:
-    """Return the arguments of `compute_reward` for a step: both goals (N, goal size) and info."""
+    """Return achieved and desired goals (N, goal size) and the info of a step."""
     info = {'is_success': result.success.astype(np.float64), 'diverged': result.diverged}
     return result.observation['achieved_goal'], result.observation['desired_goal'], info
 
 
 def _masked(values: Mapping[str, Any], mask: Flags) -> dict[str, Any]:
-    """Return info as Gymnasium's batches have it: values (N,), and a mask `_<name>` for each."""
+    """Return the values (N,) with a mask `_<name>` for each, the format of Gymnasium's infos."""
     return {**values, **{f'_{name}': mask.copy() for name in values}}
 
 
 def _only(values: Mapping[str, NDArray[Any]], mask: Flags) -> dict[str, NDArray[Any]]:
-    """Return the values (N,), zero where `mask` is False, as Gymnasium's batches are."""
+    """Return copies of the values (N,) that are zero where `mask` is False."""
     return {name: np.where(mask, rows, np.zeros_like(rows)) for name, rows in values.items()}

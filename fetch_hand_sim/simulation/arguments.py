@@ -1,4 +1,4 @@
-"""Checks of arguments: errors name the argument before a library fails on it."""
+"""Checks of arguments, whose errors name the argument, the given value and the allowed ones."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Seeds = int | Sequence[Seed] | None
 
 
 def require_whole(name: str, value: Any, lowest: int = 0, highest: int | None = 2**31 - 1) -> None:
-    """Raise ValueError unless `value` is an integer (not a boolean) within the limits."""
+    """Raise ValueError unless `value` is an integer, not a boolean, from `lowest` to `highest`."""
     is_whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
     if not is_whole or value < lowest or (highest is not None and value > highest):
         allowed = f'from {lowest}' if highest is None else f'{lowest} ... {highest}'
@@ -30,7 +30,7 @@ def require_whole(name: str, value: Any, lowest: int = 0, highest: int | None = 
 
 
 def finite_numbers(name: str, values: ArrayLike, *shapes: tuple[int, ...]) -> NDArray[np.floating]:
-    """Return finite numbers of one of the shapes as float32 or float64, or raise ValueError."""
+    """Return finite numbers of one of `shapes` as float32 or float64, or raise ValueError."""
     try:
         array = np.asarray(values)
     except ValueError:
@@ -50,7 +50,7 @@ def finite_numbers(name: str, values: ArrayLike, *shapes: tuple[int, ...]) -> ND
 
 
 def nearest_quaternions(goals: Array, achieved_goals: Array) -> Array:
-    """Return poses (n, 7) with unit quaternions in the hemisphere of the object's quaternion.
+    """Return goal poses (n, 7) with unit quaternions; of q and -q, the one nearer to the object's.
 
     A zero quaternion raises ValueError.
     """
@@ -63,10 +63,10 @@ def nearest_quaternions(goals: Array, achieved_goals: Array) -> Array:
 
 
 def each_of(name: str, given: Any, count: int) -> list[Any]:
-    """Return a value or None for each of `count` simulations.
+    """Return a list with a value or None for each of `count` simulations.
 
-    `given` is one value for all, or a list or rows with one for each; ValueError for another number
-    of them. A goal that is a list of numbers is one value.
+    `given` is one value for all simulations, or `count` values: a list, a tuple or the rows of an
+    array. Another number of values raises ValueError. A goal as a list of numbers is one value.
     """
     is_list = isinstance(given, list | tuple)
     if is_list and name == 'goal':
@@ -79,7 +79,7 @@ def each_of(name: str, given: Any, count: int) -> list[Any]:
 
 
 def selected_simulations(ids: ArrayLike, num_envs: int) -> NDArray[np.intp]:
-    """Return the simulations of distinct indices or of a mask (N,), or raise ValueError."""
+    """Return the indices that `ids` selects; ValueError unless distinct indices or a mask (N,)."""
     selected = np.asarray(ids)
     if selected.dtype == bool and selected.shape == (num_envs,):
         return np.flatnonzero(selected)
@@ -99,7 +99,7 @@ def selected_simulations(ids: ArrayLike, num_envs: int) -> NDArray[np.intp]:
 def generators(seed: Seeds, selected: NDArray[np.intp]) -> list[np.random.Generator | None]:
     """Return a new random generator for each selected simulation; None keeps the old one.
 
-    `seed` is that of `Simulation.reset`; invalid seeds raise ValueError.
+    `seed` is as in `Simulation.reset`; invalid seeds raise ValueError.
     """
     if seed is None:
         return [None] * selected.size
@@ -129,26 +129,27 @@ _DEEPEST = 0.005
 
 @dataclass(frozen=True, slots=True)
 class StartState:
-    """Values of single coordinates, by their place in `qpos` and `qvel`."""
+    """Start values of some coordinates, by their index in `qpos` or `qvel`."""
 
     positions: dict[int, float] = field(default_factory=dict)
     velocities: dict[int, float] = field(default_factory=dict)
 
     def write(self, qpos: Array, qvel: Array) -> None:
-        """Write the values into the rows `qpos` and `qvel` of one simulation."""
+        """Write the values into `qpos` (nq,) and `qvel` (nv,) of one simulation."""
         for row, values in ((qpos, self.positions), (qvel, self.velocities)):
             row[list(values)] = list(values.values())
 
 
 def read_start(given: Any, task: Task) -> StartState:
-    """Return the start state that a user describes.
+    """Return the start state that a user describes, or raise ValueError.
 
-    Velocities of what is placed are zero unless given.
+    Joints and objects with a given position start at rest unless a velocity is given, too.
 
     Args:
-        given: A mapping with some of `joints` and `joint_velocities`: numbers by joint name, or all
-            in the order of `joint_states`, rad or m (/s); `object_pose`: (7,), m and quaternion
-            wxyz, world; `object_velocity`: (6,), linear m/s and angular rad/s, world axes.
+        given: A mapping with some of these entries. `joints` and `joint_velocities`: numbers by
+            joint name, or all in the order of `joint_states`, rad or m (/s). `object_pose`: (7,),
+            m and quaternion wxyz, world. `object_velocity`: (6,), linear m/s and angular rad/s,
+            world axes.
     """
     parts, start = entries('start', given, PARTS), StartState()
     settled = task.new_data(task.start_state).qpos
@@ -172,7 +173,7 @@ def read_start(given: Any, task: Task) -> StartState:
 
 
 def _by_joint(part: str, parts: Mapping[str, Any], task: Task) -> dict[str, float]:
-    """Return the given numbers by joint name; ValueError for unknown joints or wrong counts."""
+    """Return the entry `part` of a start state as numbers by joint name, or raise ValueError."""
     joints, given = task.spec.robot.joints, parts.get(part, {})
     if not isinstance(given, Mapping):
         values = finite_numbers(f'start {part}', given, (len(joints),))
@@ -212,7 +213,7 @@ def _require_within(name: str, values: ArrayLike, lowest: float, highest: float)
 
 
 def _require_apart(start: StartState, task: Task) -> None:
-    """Raise a `ValueError` if placed bodies are inside others."""
+    """Raise ValueError if bodies overlap by more than `_DEEPEST` in the start state."""
     data, model = task.new_data(task.start_state), task.model
     start.write(data.qpos, data.qvel)
     mujoco.mj_forward(model, data)

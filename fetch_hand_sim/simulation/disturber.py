@@ -47,10 +47,10 @@ _OBJECT_TOPICS = ('object_pose', 'object_twist', 'object_joint')
 
 
 class Disturber:
-    """The disturbances of N simulations of one task.
+    """Applies disturbances to N simulations of one task.
 
-    All random numbers of an episode come from one stream that belongs to the episode's seed and is
-    independent of the draws of start and goal.
+    Each episode has a random generator for its disturbances. Its numbers follow from the seed of
+    the episode, and do not change the draws of start and goal.
 
     Attributes:
         variations: Values drawn for the running episodes, (N,) each, by the names in `VARIATIONS`.
@@ -132,11 +132,11 @@ class Disturber:
 
     @property
     def varies_physics(self) -> bool:
-        """True if simulations differ from the model."""
+        """True if the physics of a simulation may differ from the model."""
         return bool(self._physics.names)
 
     def start_nominal(self, ids: Ids) -> None:
-        """Restore the model's physics, in which the task draws its start state."""
+        """Restore the physics of the model; call it before the task draws a start state."""
         self._physics.restore(ids)
 
     def start(
@@ -145,7 +145,13 @@ class Disturber:
         streams: Sequence[np.random.Generator],
         given: Mapping[int, Mapping[str, float]],
     ) -> None:
-        """Draw and apply the disturbances of new episodes; the task has set their start state."""
+        """Draw and apply the disturbances of new episodes whose start state the task has set.
+
+        Args:
+            ids: The simulations, (n,).
+            streams: A random generator for each of them.
+            given: Variations in place of drawn ones, by simulation and name.
+        """
         for index, stream in zip(ids.tolist(), streams, strict=True):
             self._streams[index] = stream
             self._draw_episode(index, stream, given.get(index, {}))
@@ -174,7 +180,7 @@ class Disturber:
         self._start_joints[index] = stream.standard_normal(self._angles.size)
 
     def _drawn(self, name: str, share: float) -> float:
-        """Return the value of a variation that is `share` of the way through its range."""
+        """Return a value of a variation: the lowest for `share` 0, the highest for `share` 1."""
         if name == 'gravity_direction':
             return share * 2.0 * np.pi
         group, field_name = _SPANS[name]
@@ -190,7 +196,7 @@ class Disturber:
         self._uniform[index] = stream.random(self._uniform.shape[1:])
 
     def _shift_start(self, ids: Ids) -> bool:
-        """Move objects and joints of new episodes; return whether something has moved."""
+        """Shift objects and joints at the start of episodes; return whether any has moved."""
         start, moved = self.disturbances.start, False
         qpos: Array = self._task.batch.bind('qpos')
         if self._task.object_qpos is not None:
@@ -210,7 +216,7 @@ class Disturber:
     # Commands
 
     def command(self, commands: NDArray[np.floating]) -> NDArray[np.floating]:
-        """Delay, drop or change commands; return those that reach the motors, (N, action size)."""
+        """Return the commands (N, action size) after delay, loss, repetition, noise and bias."""
         self._tick += 1
         for index in np.flatnonzero(self._tick % _BLOCK == 0).tolist():
             self._draw_block(index)
@@ -231,17 +237,17 @@ class Disturber:
         return disturbed.astype(commands.dtype)
 
     def _chance(self, number: int) -> Array:
-        """Return one of the five uniform random numbers of this tick, (N,)."""
+        """Return the uniform random numbers (N,) of this tick for purpose `number`, 0 ... 4."""
         return np.asarray(self._uniform[self._all, self._tick % _BLOCK, number])
 
     def _error(self, name: str, noise: float | Array) -> Array:
-        """Return noise and bias of this tick, (N, columns)."""
+        """Return the error of a signal at this tick, (N, columns): its bias plus white noise."""
         columns = self._columns[name]
         white = self._normal[self._all, self._tick % _BLOCK, columns]
         return np.asarray(noise * white + self._biases[:, columns])
 
     def push(self, forces: Array) -> bool:
-        """Add the pushes of this tick to (N, bodies, 6) wrenches; return whether there are any."""
+        """Add the pushes of this tick to wrenches (N, bodies, 6); return whether there are any."""
         pushes = self.disturbances.pushes
         if not pushes.force:
             return False
@@ -253,21 +259,21 @@ class Disturber:
     # Sensors
 
     def sense(self) -> None:
-        """Take the measurements of this tick; `readings` returns them until the next."""
+        """Measure all sensors; `readings` returns these measurements until the next call."""
         self._sense(self._all, is_first=False)
 
     def readings(self) -> Readings:
-        """Return what the disturbed sensors measured last, fresh arrays."""
+        """Return the last measurements of the disturbed sensors, in new arrays."""
         return {name: values.copy() for name, values in self._held.items()}
 
     def true_readings(self) -> Readings:
-        """Return what undisturbed sensors measure now, fresh arrays."""
+        """Return the present values of undisturbed sensors, in new arrays."""
         if not self._is_true_current:
             return self._task.readings()
         return {name: past[0].copy() for name, past in self._true.items()}
 
     def note_written_state(self) -> None:
-        """Read the true sensors again, because the user has changed the state."""
+        """Let `true_readings` measure again, because the user has changed the state."""
         self._is_true_current = False
 
     def _sense(self, ids: Ids, is_first: bool) -> None:
@@ -356,7 +362,7 @@ _STATE = (
 
 
 def _variation(name: str, value: Any) -> float:
-    """Return the value of a variation, or raise a `ValueError` with the allowed range."""
+    """Return the value of a variation as a float; raise ValueError if it is not allowed."""
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
         raise ValueError(f'variation {name}={value!r:.40}; allowed: one finite number')
     if name != 'gravity_direction':
@@ -366,7 +372,7 @@ def _variation(name: str, value: Any) -> float:
 
 
 def _turned(quaternion: Array, turn: Array) -> Array:
-    """Turn quaternions (N, 4) wxyz by rotation vectors (N, 3), rad, world axes."""
+    """Rotate quaternions (N, 4) wxyz by rotation vectors (N, 3), rad, in world axes."""
     angle = np.linalg.norm(turn, axis=1, keepdims=True)
     axis = turn / np.maximum(angle, 1e-12)
     rotation = np.concatenate([np.cos(angle / 2.0), np.sin(angle / 2.0) * axis], axis=1)
@@ -377,10 +383,10 @@ def _turned(quaternion: Array, turn: Array) -> Array:
 
 
 class VariedPhysics:
-    """Writes the variations of each simulation into its own copy of some model fields.
+    """Gives each simulation its own copy of some model fields, with varied values.
 
     Attributes:
-        names: The variations that this task and its disturbances can have.
+        names: The variations that are switched on.
     """
 
     def __init__(self, task: Task, physics: PhysicsDisturbance) -> None:
@@ -425,7 +431,7 @@ class VariedPhysics:
         return any(len(rows) for rows in self._rows[name].values())
 
     def allow(self, name: str) -> None:
-        """Prepare the model for a variation that is off by default, or raise ValueError."""
+        """Switch on a variation, or raise ValueError if the task or the model does not allow it."""
         if name in self.names:
             return
         if not self._has(name):
@@ -442,12 +448,12 @@ class VariedPhysics:
         self.names.append(name)
 
     def restore(self, ids: Ids) -> None:
-        """Give simulations the physics of the model."""
+        """Restore the physics of the model in simulations `ids`."""
         for field, values in self._live.items():
             values[ids] = self._nominal[field]
 
     def apply(self, ids: Ids, variations: Mapping[str, Array]) -> bool:
-        """Write variations (N,) of simulations in nominal physics; return whether any are on."""
+        """Apply variations (N,) to simulations after `restore`; return whether any is on."""
         for name in self.names:
             factors, live = variations[name][ids], self._live
             for field, rows in self._rows[name].items():
@@ -467,7 +473,7 @@ class VariedPhysics:
         return bool(self.names)
 
     def _tilted(self, tilt: Array, direction: Array) -> Array:
-        """Return gravity (n, 3), m/s^2, tilted by `tilt` (n,) towards `direction` (n,), rad."""
+        """Return gravity (n, 3), m/s^2, tilted by `tilt`, rad, towards the azimuth `direction`."""
         strength = float(np.linalg.norm(self._nominal['opt.gravity']))
         across = np.sin(tilt) * strength
         return np.stack(
@@ -477,6 +483,6 @@ class VariedPhysics:
 
 
 def first_body(model: mujoco.MjModel, names: tuple[str | None, ...]) -> int:
-    """Return the number of the first of these bodies that the model has, or 0."""
+    """Return the index of the first of these bodies that exists in the model, else 0."""
     numbers = (find(model, mujoco.mjtObj.mjOBJ_BODY, str(name)) for name in names)
     return next((number for number in numbers if number > 0), 0)

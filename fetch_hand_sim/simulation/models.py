@@ -3,9 +3,9 @@
 The package only contains the assets. It is never imported, because importing it with MuJoCo >= 3.17
 registers environments that do not start.
 
-Tuning makes a model faster to step without changing a bit of any trajectory: stages whose results
-are unused are switched off, and collision detection tests fewer pairs of geoms, with the same
-contacts in the same order. `docs/simulation.md` lists the gains.
+Tuning makes a model faster to step; trajectories stay the same, bit for bit. It disables stages
+whose results are unused. It also reduces the pairs of geoms that collision detection tests, with
+the same contacts in the same order. `docs/simulation.md` lists the gains.
 """
 
 from __future__ import annotations
@@ -47,7 +47,11 @@ FETCH_NEVER_TOUCHING = (
 
 
 def asset_path(relative: str) -> Path:
-    """Return the path of an asset such as `fetch/reach.xml`, if it exists; absolute paths stay."""
+    """Return the path of an asset such as `fetch/reach.xml`; absolute paths are returned unchanged.
+
+    Raises:
+        FileNotFoundError: If the asset, or the package that contains it, is missing.
+    """
     if Path(relative).is_absolute():
         return Path(relative)
     spec = util.find_spec('gymnasium_robotics')
@@ -73,19 +77,19 @@ def load_model(relative: str) -> mujoco.MjModel:
 
 
 def compiled_bytes(model: mujoco.MjModel) -> bytes:
-    """Return the model as MuJoCo's binary format MJB, which only the same MuJoCo version reads."""
+    """Return the model in the binary format MJB, which only the same MuJoCo version reads."""
     buffer = np.empty(mujoco.mj_sizeModel(model), dtype=np.uint8)
     mujoco.mj_saveModel(model, None, buffer)
     return buffer.tobytes()
 
 
 def find(model: mujoco.MjModel, kind: Any, name: str) -> int:
-    """Return the number of an element, such as a body (`mjOBJ_BODY`), or -1 if it is missing."""
+    """Return the index of a model element; `kind` is for example `mjOBJ_BODY`. -1 if missing."""
     return int(mujoco.mj_name2id(model, kind.value, name))
 
 
 def free_joint(model: mujoco.MjModel, body: str | None) -> tuple[slice, slice] | tuple[None, None]:
-    """Return the places of a body's free joint in qpos (7) and qvel (6); None if it is missing."""
+    """Return the slices of the free joint `<body>:joint` in qpos and qvel; None if missing."""
     number = find(model, mujoco.mjtObj.mjOBJ_JOINT, f'{body}:joint')
     if number < 0 or model.jnt_type[number] != mujoco.mjtJoint.mjJNT_FREE.value:
         return None, None
@@ -94,7 +98,7 @@ def free_joint(model: mujoco.MjModel, body: str | None) -> tuple[slice, slice] |
 
 
 def geom_color(model: mujoco.MjModel, geom: int) -> Array:
-    """Return the colour (4,) that MuJoCo draws: the geom's own, or that of its material."""
+    """Return the RGBA colour (4,) in which MuJoCo draws a geom: its own, or its material's."""
     own = np.array(model.geom_rgba[geom], dtype=np.float64)
     material = int(model.geom_matid[geom])
     if material < 0 or not np.array_equal(own, _NO_COLOR):
@@ -114,7 +118,7 @@ def exclude_body_pairs(spec: mujoco.MjSpec, pairs: Sequence[tuple[str, str]]) ->
 
 
 def list_geom_pairs(spec: mujoco.MjSpec) -> None:
-    """Replace the search for pairs of geoms that may collide by a fixed list of these pairs.
+    """Replace MuJoCo's search for geoms that may collide by a fixed list of their pairs.
 
     A short list is cheaper than sorting all bodies along an axis at every substep.
     """
@@ -133,7 +137,7 @@ def list_geom_pairs(spec: mujoco.MjSpec) -> None:
 
 
 def collision_candidates(model: mujoco.MjModel) -> list[tuple[int, int]]:
-    """Return the pairs of geoms that pass MuJoCo's filters, ascending, without explicit pairs."""
+    """Return the pairs of geoms that MuJoCo tests, ascending, except pairs that the model lists."""
     listed = set(zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True))
     return [
         (first, second)
@@ -146,7 +150,7 @@ def collision_candidates(model: mujoco.MjModel) -> list[tuple[int, int]]:
 
 
 def skip_unread_stages(model: mujoco.MjModel) -> None:
-    """Switch off unused sensors, and constraint islands in models with a single tree."""
+    """Disable sensors, and constraint islands in models with a single kinematic tree."""
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_SENSOR.value
     if model.ntree == 1:
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ISLAND.value
@@ -158,10 +162,10 @@ def _masks_match(model: mujoco.MjModel, first: int, second: int) -> bool:
 
 
 def _bodies_may_collide(model: mujoco.MjModel, first: int, second: int) -> bool:
-    """Return whether MuJoCo tests two bodies for collision.
+    """Return whether MuJoCo tests the bodies of two geoms for collision.
 
-    It does not if they are welded together, are parent and child (unless the parent is the world),
-    or are excluded in the model.
+    MuJoCo skips bodies that are welded together, that are parent and child (unless the parent is
+    the world), or that the model excludes.
     """
     bodies = sorted((int(model.geom_bodyid[first]), int(model.geom_bodyid[second])))
     if (bodies[0] << 16) + bodies[1] in model.exclude_signature:
@@ -174,10 +178,10 @@ def _bodies_may_collide(model: mujoco.MjModel, first: int, second: int) -> bool:
 
 
 def mix(model: mujoco.MjModel, first: Geoms, second: Geoms) -> dict[str, NDArray[Any]]:
-    """Return contact parameters (n, ...) of pairs of geoms (n,), by the names of `MjsPair`.
+    """Return the contact parameters (n, ...) of n pairs of geoms, by the names of `MjsPair`.
 
-    Equal to `mj_contactParam`: the geom with the higher priority decides; geoms of equal priority
-    are mixed. Margins and gaps add up.
+    The result equals that of `mj_contactParam`. The geom with the higher priority decides. The
+    parameters of geoms with equal priority are mixed. Margins and gaps add up.
     """
     priority = model.geom_priority
     # A geom with the higher priority is mixed with itself.
@@ -206,12 +210,12 @@ def mix(model: mujoco.MjModel, first: Geoms, second: Geoms) -> dict[str, NDArray
 
 
 def _rows(flags: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Reduce flags (n, ...) to (n,): whether any flag of a row is True."""
+    """Reduce flags (n, ...) to (n,), True where any flag of the row is True."""
     return np.asarray(flags.any(axis=tuple(range(1, flags.ndim))))
 
 
 def _share(one: NDArray[Any], other: NDArray[Any]) -> NDArray[Any]:
-    """Return the weight of the first of two geoms, from both values of `solmix`."""
+    """Return the weight (n,) of the first of two geoms in a mix, from their values of `solmix`."""
     small_one, small_other = one < mujoco.mjMINVAL, other < mujoco.mjMINVAL
     weighed = one / np.where(small_one | small_other, 1.0, one + other)
     cases = [small_one & small_other, small_one, small_other]
@@ -219,9 +223,9 @@ def _share(one: NDArray[Any], other: NDArray[Any]) -> NDArray[Any]:
 
 
 class ListedPairs:
-    """Keeps the contact parameters of listed pairs equal to those of their geoms.
+    """Updates the contact parameters of listed pairs when the parameters of their geoms change.
 
-    Pairs whose parameters differ from their geoms in the compiled model are never changed.
+    Pairs with parameters of their own in the compiled model are never changed.
     """
 
     def __init__(self, model: mujoco.MjModel) -> None:

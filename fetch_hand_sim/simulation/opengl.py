@@ -32,8 +32,8 @@ def prepare_opengl() -> str:
     """Prepare this process for rendering; return the name of the backend.
 
     Raises:
-        RuntimeError: If no backend works; the message names the packages to install. Or if this
-            process was forked from one that renders: OpenGL would wait for its missing threads.
+        RuntimeError: If no backend works (the message names the packages to install), or if this
+            process was forked from one that renders (OpenGL would wait for missing threads).
     """
     backend = _backend()
     if _process_that_draws() != os.getpid():
@@ -46,9 +46,9 @@ def prepare_opengl() -> str:
 
 @contextlib.contextmanager
 def context_of_its_own() -> Iterator[None]:
-    """Restore the OpenGL context of this thread afterwards, so that other renderers keep theirs.
+    """Restore the OpenGL context of this thread after the block, which may use another one.
 
-    With EGL the context used inside becomes free for other threads.
+    With EGL, other threads may then use the context of the block.
     """
     before = _current_of_egl()
     try:
@@ -65,7 +65,7 @@ def context_of_its_own() -> Iterator[None]:
 
 
 def _current_of_egl() -> tuple[Any, ...] | None:
-    """Return display, surfaces and context of this thread for `eglMakeCurrent`, or None."""
+    """Return the arguments with which `eglMakeCurrent` restores this thread's context, or None."""
     egl = sys.modules.get('mujoco.egl')
     if egl is None or egl.EGL_DISPLAY is None or not (context := egl.EGL.eglGetCurrentContext()):
         return None
@@ -83,7 +83,7 @@ def _process_that_draws() -> int:
 def _backend() -> str:
     """Choose the backend for this process: `MUJOCO_GL`, then a display, then EGL, then OSMesa.
 
-    GLFW is not tried without a display, because MuJoCo's second attempt ends the process.
+    GLFW is not tried without a display, because a second attempt would end the process.
     """
     asked = os.environ.get('MUJOCO_GL', '').strip().lower()
     if asked in _WINDOWS and not _has_display():
@@ -107,9 +107,9 @@ def _backend() -> str:
 
 
 def _has_device() -> bool:
-    """Return whether EGL has a device; the library alone, without drivers, has none.
+    """Return whether EGL finds a device; without drivers it finds none.
 
-    Calls EGL directly, because PyOpenGL cannot leave EGL once MuJoCo has tried it.
+    Calls EGL directly, because PyOpenGL cannot change the backend after MuJoCo has tried EGL.
     """
     egl = ctypes.CDLL(_EGL)
     egl.eglGetProcAddress.restype = ctypes.c_void_p
@@ -130,7 +130,7 @@ def _has_device() -> bool:
 
 
 def _has_display() -> bool:
-    """Return whether a window can be opened; `DISPLAY` may belong to an ended session."""
+    """Return whether a window can be opened; `DISPLAY` alone may name a session that has ended."""
     if sys.platform != 'linux':
         return True
     if not (os.environ.get('DISPLAY') or os.environ.get('WAYLAND_DISPLAY')):
@@ -142,7 +142,7 @@ def _has_display() -> bool:
 
 
 def start_glfw() -> bool:
-    """Start GLFW; return False without a display. Raise ImportError if GLFW is not installed."""
+    """Start GLFW; return False without a display, raise ImportError if GLFW is not installed."""
     import glfw
 
     with warnings.catch_warnings():

@@ -31,9 +31,9 @@ class SceneRenderer:
 
     Args:
         width: Pixels, 1 ... `LARGEST_SIDE`.
-        height: Likewise.
+        height: Pixels, 1 ... `LARGEST_SIDE`.
         camera: Name of a camera of the model, or attributes of `mujoco.MjvCamera` that change the
-            scene's view; None for that view.
+            scene's view; None for the unchanged view.
 
     Raises:
         ValueError: If the camera is unknown or the size is not allowed.
@@ -63,7 +63,7 @@ class SceneRenderer:
             raise RuntimeError(f'{ADVICE} ({error})') from error
 
     def render(self, frame: Frame, trail: Sequence[Array] = ()) -> Picture:
-        """Return the picture of a frame, (height, width, 3).
+        """Return the picture of a frame, (height, width, 3) bytes.
 
         Args:
             trail: Earlier positions of the object or gripper, (3,) each.
@@ -93,7 +93,7 @@ class SceneRenderer:
 
     @contextlib.contextmanager
     def _in_its_thread(self) -> Iterator[None]:
-        """Turn an OpenGL error of a call from another thread into a RuntimeError of one line."""
+        """Replace errors of the block by a one-line RuntimeError if another thread owns OpenGL."""
         try:
             with context_of_its_own():
                 yield
@@ -114,7 +114,7 @@ class SceneRenderer:
 
 
 def make_options() -> mujoco.MjvOption:
-    """Return drawing options: no helper lines, only sites of the group `SHOWN_SITES`."""
+    """Return options that hide rangefinder rays and all sites outside of group `SHOWN_SITES`."""
     options = mujoco.MjvOption()
     options.flags[mujoco.mjtVisFlag.mjVIS_RANGEFINDER.value] = 0
     options.sitegroup[:] = 0
@@ -129,7 +129,7 @@ def check_size(width: object, height: object) -> None:
 
 
 def make_camera(scene: Scene, name: str | Mapping[str, Any] | None) -> mujoco.MjvCamera:
-    """Return a camera by name, or the view with changed attributes; ValueError if unknown."""
+    """Return the camera `name`, or the scene's view changed by attributes, or raise ValueError."""
     camera = mujoco.MjvCamera()
     if name is None or isinstance(name, Mapping):
         scene.view.apply(camera)
@@ -147,7 +147,7 @@ def set_attributes(
     """Set attributes of a camera of a model.
 
     Raises:
-        ValueError: For values with which MuJoCo renders nothing or ends the process, among others.
+        ValueError: If an attribute is unknown, or if MuJoCo cannot render with its value.
     """
     known = [name for name in dir(mujoco.MjvCamera) if not name.startswith('_')]
     for name, value in entries('default_camera_config', attributes, known).items():
@@ -176,7 +176,7 @@ def _refuse(name: str, value: object, allowed: str) -> NoReturn:
 
 
 def simulation_frame(simulation: Simulation, index: int = 0) -> Frame:
-    """Return the present frame of one copy of a simulation."""
+    """Return the present frame of copy `index` of a simulation."""
     readings, observation = simulation.readings(), simulation.observe()
     achieved, desired = observation['achieved_goal'][index], observation['desired_goal'][index]
     spec = simulation.spec

@@ -1,7 +1,7 @@
 """Goal distances, success rules and rewards: pure functions of goals of any batch shape.
 
-Hindsight replay swaps goals after the fact, so nothing here may depend on the simulation. Sums run
-in a fixed order, so a batch gives the same bits as one call per row.
+Hindsight replay replaces goals after an episode, so these functions do not use the simulation. Sums
+run in a fixed order, so a batch gives the same bits as one call per row.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from msgs_spec.text import one_of
 
 
 def _norm(difference: Array) -> Array:
-    """Return Euclidean norms over the last axis, summed in an order independent of the layout."""
+    """Return Euclidean norms over the last axis; the order of the sum is fixed."""
     total = np.zeros(difference.shape[:-1])
     for index in range(difference.shape[-1]):
         part = difference[..., index]
@@ -32,7 +32,7 @@ def _norm(difference: Array) -> Array:
 # Without slots, so that copies and pickles keep further attributes of subclasses.
 @dataclass(frozen=True)
 class GoalMetric:
-    """Distance between goals, success rule and reward of a task.
+    """Computes goal distances, success and rewards of a task.
 
     A subclass may have more fields or attributes; `with_changes` keeps them.
 
@@ -53,7 +53,7 @@ class GoalMetric:
         one_of(self.reward_type, REWARD_TYPES, 'reward_type')
 
     def with_changes(self, **changes: Any) -> Self:
-        """Return a copy with other values of some fields.
+        """Return a copy with new values of some fields.
 
         `dataclasses.replace` would call `__init__` and lose further attributes of subclasses.
         """
@@ -65,13 +65,13 @@ class GoalMetric:
 
     @property
     def has_own_reward(self) -> bool:
-        """True if a subclass replaces the sparse and the dense reward."""
+        """True if a subclass overrides `reward`."""
         return type(self).reward is not GoalMetric.reward
 
     def distances(self, achieved_goal: ArrayLike, desired_goal: ArrayLike) -> tuple[Array, Array]:
-        """Return distance, m, and rotation, rad, (...) each, between goals (..., goal size).
+        """Return distances (...), m, and rotations (...), rad, between goals (..., goal size).
 
-        A part that does not count for the task is zero. Wrong sizes or shapes raise ValueError.
+        Distance or rotation is zero if the task ignores it. Wrong shapes raise ValueError.
         """
         achieved = self._checked('achieved_goal', achieved_goal)
         desired = self._checked('desired_goal', desired_goal)
@@ -98,9 +98,9 @@ class GoalMetric:
     def reward(self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any = None) -> Array:
         """Return the reward (...) of goals (..., goal size).
 
-        Sparse: 0 where the goal is reached, -1 elsewhere. Dense: minus the distance in metres; for
-        poses minus (10 x metres + radians), as in Gymnasium-Robotics `manipulate.py`. `info` is
-        ignored; it is part of Gymnasium's signature.
+        Sparse: 0 where the goal is reached, -1 elsewhere. Dense: minus the distance, m; for poses
+        minus (10 x distance + rotation), m and rad, as in `manipulate.py` of Gymnasium-Robotics.
+        `info` is ignored; it is part of Gymnasium's signature.
         """
         del info
         return self._reward(*self.distances(achieved_goal, desired_goal))
@@ -110,8 +110,8 @@ class GoalMetric:
     ) -> tuple[Array, NDArray[np.bool_]]:
         """Return reward and success of goals (..., goal size), computing distances once.
 
-        It calls `success` and `reward` of a subclass that overrides them, so that steps and
-        relabelled transitions get the same rewards.
+        If a subclass overrides `success` or `reward`, this method calls them. Steps and relabelled
+        transitions therefore get the same rewards.
         """
         if self.has_own_reward or type(self).success is not GoalMetric.success:
             reward = self.reward(achieved_goal, desired_goal)

@@ -1,7 +1,7 @@
-"""Scenes for pictures: the model of a task with floor and light, its goal as a ghost, markers.
+"""Scenes for pictures: the model of a task with floor, light, markers and a ghost of the goal.
 
-Pages and films share them. A scene shows the frame of one tick, live or from a file, and computes
-no physics.
+The web page and films use the same scenes. A scene shows the frame of one tick, live or from a
+file, and computes no physics.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ def default_view(spec: TaskSpec) -> View:
 
 
 def model_view(model: mujoco.MjModel) -> View:
-    """Return MuJoCo's default camera: `<statistic>` and `<visual><global>` of the model."""
+    """Return the view that `<statistic>` and `<visual><global>` of the model define."""
     camera = mujoco.MjvCamera()
     mujoco.mjv_defaultFreeCamera(model, camera)
     x, y, z = camera.lookat.tolist()
@@ -88,10 +88,10 @@ class Frame:
     Attributes:
         joint_position: (joints,) in the order of `joint_states`, rad or m.
         desired_goal: (goal size,), m and quaternion wxyz.
-        achieved_goal: Likewise.
+        achieved_goal: (goal size,), m and quaternion wxyz.
         object_pose: (7,) m and quaternion wxyz; None for tasks without an object.
-        qpos: (nq,) positions of all joints of the model. None, as in a log, leaves the joints that
-            are not in `joint_position` where they are.
+        qpos: (nq,) positions of all joints of the model. With None, as in frames from a log, joints
+            that are not in `joint_position` keep their positions.
     """
 
     joint_position: Array
@@ -104,14 +104,14 @@ class Frame:
 
 @dataclass(frozen=True, slots=True)
 class Marker:
-    """A shape in the world.
+    """A geometric shape that is drawn at a pose in the world.
 
     Attributes:
-        shape: `mujoco.mjtGeom`.
+        shape: Value of `mujoco.mjtGeom`.
         size: (3,) MuJoCo's sizes of the shape, m.
         position: (3,) m.
         quaternion: (4,) wxyz.
-        color: Red, green, blue, opacity.
+        color: Red, green, blue and opacity, 0 ... 1 each.
     """
 
     shape: int
@@ -129,7 +129,7 @@ class Marker:
 
 
 class Scene:
-    """Robot, object and ghost of a task in the poses of frames.
+    """Shows robot, object and goal of a task in the state of a frame.
 
     Attributes:
         spec: The task, whose thresholds the markers show; it may be replaced.
@@ -157,7 +157,7 @@ class Scene:
         return is_pose and self.spec.has_object and self._ghost is not None
 
     def show(self, frame: Frame) -> None:
-        """Pose robot, object and ghost, and all other joints if the frame contains them."""
+        """Set the poses of robot, object and ghost; set other joints if the frame has `qpos`."""
         if frame.qpos is not None and frame.qpos.shape == self.data.qpos.shape:
             self.data.qpos[:] = frame.qpos
         self.data.qpos[self._joints] = frame.joint_position
@@ -191,7 +191,7 @@ class Scene:
         return [self._geom_marker(geom, frame.object_pose) for geom in range(first, first + count)]
 
     def table_markers(self) -> list[Marker]:
-        """Return the fixed geoms except robot and floor: the table of the Fetch tasks."""
+        """Return the fixed geoms except robot and floor, such as the table of the Fetch tasks."""
         return self._table
 
     @cached_property
@@ -220,7 +220,7 @@ class Scene:
         return Marker(shape, size, position, (red, green, blue, opacity), quaternion)
 
     def _shell(self, frame: Frame, color: Color) -> list[Marker]:
-        """Return markers slightly larger than the ghost that show whether the goal is reached."""
+        """Return a marker around the ghost whose colour shows whether the goal is reached."""
         geom = self.model.geom(GHOST)
         pose = ghost_pose(self.spec, frame.desired_goal)
         tint = (*color[:3], 2.0 * _HALO_OPACITY)
@@ -229,7 +229,7 @@ class Scene:
 
 
 def ghost_pose(spec: TaskSpec, goal: Array) -> Array:
-    """Return the pose (7,) in which the ghost of a pose goal (7,) is drawn."""
+    """Return the pose (7,) in which to draw the ghost of a pose goal (7,)."""
     pose = np.array(goal)
     if not spec.position_counts:
         pose[:3] += GHOST_OFFSET
@@ -244,7 +244,7 @@ def tracked_position(frame: Frame) -> Array:
 
 
 def trail_of(frames: Sequence[Frame], index: int) -> list[Array]:
-    """Return the last `TRAIL_TICKS` tracked positions up to a frame, (3,) each."""
+    """Return tracked positions (3,) of frame `index` and of `TRAIL_TICKS` frames before it."""
     return [tracked_position(frame) for frame in frames[max(0, index - TRAIL_TICKS) : index + 1]]
 
 
@@ -277,7 +277,7 @@ def _fingertip_markers(frame: Frame, color: Color) -> list[Marker]:
 
 
 def _line(points: Iterable[Array], width: float, color: Color = _TRAIL) -> list[Marker]:
-    """Return capsules from point to point."""
+    """Return capsules that connect consecutive points; `width` is the radius, m."""
     return [
         _capsule(start, end, width, color)
         for start, end in pairwise(points)
@@ -296,7 +296,7 @@ def _capsule(start: Array, end: Array, width: float, color: Color) -> Marker:
 
 
 def _dress(mjcf: mujoco.MjSpec) -> None:
-    """Add floor, sky and shadow to the model of the task; hide its own goal markers."""
+    """Set floor, sky and light of the model of a task; hide its goal markers and mocap body."""
     for texture in mjcf.textures:
         if texture.type == mujoco.mjtTexture.mjTEXTURE_SKYBOX:
             texture.rgb1, texture.rgb2 = [0.93, 0.95, 0.97], [0.66, 0.73, 0.8]

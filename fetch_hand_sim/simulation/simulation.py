@@ -1,8 +1,8 @@
 """`Simulation`: any number of copies of one task, stepped together.
 
 The ROS node and `gymnasium.make` use one copy, the trainer 64 and more. A `Simulation` does not
-count steps and never ends an episode; its user does. `_start` begins episodes, `_advance` applies
-commands and steps, `observe` measures.
+count steps and never ends an episode; the calling code does. `_start` begins episodes, `_advance`
+applies commands and steps, `observe` measures.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ _LOGGER = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class StepResult:
-    """Result of one step of N simulations; fresh arrays.
+    """Result of one step of N simulations, in new arrays.
 
     Attributes:
         observation: `observation`, `achieved_goal`, `desired_goal`, each (N, ...).
@@ -86,27 +86,29 @@ class Simulation:
     Args:
         task: One of the tasks (`msgs_spec.tasks.TASKS`).
         num_envs: Number of copies N, 1 or more.
-        num_threads: Threads that step them; 0 for one per processor that the process may use
-            (`taskset`, `os.sched_setaffinity`). At most N threads are started.
+        num_threads: Threads that step the copies, at most N; 0 for one per processor that the
+            process may use (`taskset`, `os.sched_setaffinity`).
         reward_type: `sparse` or `dense`.
-        success_rule: `gymnasium` (released code) or `paper` (its text).
+        success_rule: `gymnasium` (as in the released code) or `paper` (as in the text of Plappert
+            et al. 2018).
         control_hz: Actions per simulated second: 500/n for n = 1 ... 40.
-        keeps_data: Whether each copy keeps its own `MjData`; `read_data` then includes all that
-            MuJoCo derives from the state.
+        keeps_data: Whether each copy keeps its own `MjData`; `read_data` then includes all values
+            that MuJoCo derives from the state.
         timing: What stays the same at rates other than 25 Hz. `seconds`: the duration of an episode
             and the speed of the Fetch gripper. `ticks`: the steps of an episode and the gripper's
             distance per step, as in the reference.
-        disturbances: Delays, noise, other physics (`msgs_spec.disturbances.read_disturbances`).
-            `observation` is then what the disturbed sensors measure. `achieved_goal`, rewards and
-            success follow the true state.
+        disturbances: Delays, noise and changed physics, in any form that
+            `msgs_spec.disturbances.read_disturbances` accepts. `observation` then contains the
+            measurements of disturbed sensors; `achieved_goal`, rewards and success follow the true
+            state.
 
     Attributes:
         spec: The task as data, with `episode_ticks` at this rate.
-        metric: Rewards and success; it may be replaced between steps.
+        metric: Computes rewards and success; users may replace it between steps.
         divergences: Number of divergences so far.
 
     Raises:
-        ValueError: If an argument is not allowed; the message lists what is.
+        ValueError: If an argument is not allowed; the message lists the allowed values.
     """
 
     def __init__(
@@ -145,12 +147,12 @@ class Simulation:
         self.disturbances = disturbances
 
     def __repr__(self) -> str:
-        """Return task and number of copies."""
+        """Return the class, the task and the number of copies as text."""
         return f'{type(self).__name__}({self.spec.name!r}, num_envs={self.num_envs})'
 
     @property
     def goals(self) -> Array:
-        """The desired goals, (N, goal size), live: values written here count from the next step.
+        """The desired goals, (N, goal size); values written here take effect in the next step.
 
         World frame; points and fingertips in m, poses in m and as quaternion wxyz.
         """
@@ -164,7 +166,7 @@ class Simulation:
 
     @property
     def task(self) -> Task:
-        """The physics of the task."""
+        """The `Task`, which computes the physics."""
         return self._task
 
     @property
@@ -179,7 +181,7 @@ class Simulation:
 
     @property
     def is_started(self) -> NDArray[np.bool_]:
-        """Which simulations have been reset before, (N,)."""
+        """Flags (N,), True for simulations that have been reset."""
         return self._is_started.copy()
 
     @property
@@ -194,20 +196,19 @@ class Simulation:
     def read_data(self, index: int, data: Any) -> None:
         """Copy the state of simulation `index` into a `mujoco.MjData`.
 
-        Values that MuJoCo derives from the state, such as contacts, are copied with `keeps_data`.
-
-        Goals, random generators and divergence counters are not included, as in `write_data`.
+        With `keeps_data`, all values that MuJoCo derives from the state, such as contacts, are
+        copied, too. Goals, random generators and divergence counters are no part of `MjData`.
         """
         self._task.read_data(self._index(index), self._fitting(data))
 
     def write_data(self, index: int, data: Any) -> None:
-        """Continue simulation `index` from a `mujoco.MjData`."""
+        """Set the state of simulation `index` to that of a `mujoco.MjData`."""
         self._task.write_data(self._index(index), self._fitting(data))
         if self._disturber is not None:
             self._disturber.note_written_state()
 
     def apply_model_changes(self) -> None:
-        """Step with the present `model`; ValueError if disturbances vary the physics."""
+        """Use the changed `model` from now on; ValueError if disturbances vary the physics."""
         if self.varies_physics:
             raise ValueError(
                 f'the model of {self.spec.name} cannot be changed while disturbances vary its '
@@ -217,7 +218,7 @@ class Simulation:
         self._task.follow_model()
 
     def generator(self, index: int) -> np.random.Generator:
-        """Return the random generator of simulation `index`, live; it draws starts and goals."""
+        """Return the random generator, no copy, for starts and goals of simulation `index`."""
         generator = self._generators[self._index(index)]
         if generator is None:
             generator = self._generators[index] = seeding.np_random(None)[0]
@@ -235,25 +236,28 @@ class Simulation:
 
         Args:
             seed: One seed (simulation i takes seed + i), one per simulation of `ids` in their
-                order, or None to continue the random generators. The same seed gives the
-                reference's draws. A generator in place of a seed is used from then on.
+                order, or None to continue the random generators. The same seed gives the same
+                draws as in Gymnasium-Robotics. A random generator in place of a seed replaces
+                that of the simulation.
             ids: Indices or a boolean mask (N,) of the simulations; None for all.
             variation: Values for these episodes in place of drawn ones, by the names of
                 `Simulation.variation`; for simulations with `disturbances`. One mapping for all, or
                 one or None for each simulation of `ids`.
-            start: Start states in place of drawn ones, likewise: a mapping with some of `joints`,
-                `joint_velocities` (numbers by name, or all in the order of `joint_states`; rad or
-                m), `object_pose` (7,) and `object_velocity` (6,). Velocities of what is placed are
-                zero unless given; `disturbances` may shift the start.
+            start: Start states in place of drawn ones: one mapping for all, or one or None for each
+                simulation of `ids`. Its keys are some of `joints`, `joint_velocities` (numbers by
+                name, or all in the order of `joint_states`; rad or m), `object_pose` (7,) and
+                `object_velocity` (6,). Joints and objects with a given position start at rest
+                unless a velocity is given, too. `disturbances` may shift the start.
             goal: Desired goals in place of drawn ones, as `set_goal` takes them: (goal size,) for
-                all, or one or None for each simulation of `ids`. The other draws stay.
+                all, or one or None for each simulation of `ids`. The other draws
+                do not change.
 
         Returns:
             The observations of all N simulations.
 
         Raises:
             ValueError: If a seed is invalid, ids or seeds do not match the simulations, or a
-                variation, start or goal is unknown or impossible; nothing has moved then.
+                variation, start or goal is unknown or impossible. No simulation is reset then.
             RuntimeError: If the object never stays on the palm, or this process was forked and
                 lacks the threads of the batch.
         """
@@ -302,7 +306,7 @@ class Simulation:
         return self._result(self.advance(commands))
 
     def advance(self, commands: ArrayLike) -> NDArray[np.bool_]:
-        """Advance like `step_commands` without observing; return which diverged, (N,)."""
+        """Advance as `step_commands` does, but return only flags (N,) of diverged simulations."""
         return self._advance(self._finite('commands', commands))
 
     def compute_reward(
@@ -327,7 +331,7 @@ class Simulation:
         because the `gymnasium` success rule distinguishes q from -q.
 
         Args:
-            goals: (n, goal size), finite, in the order of `ids`; units and frame as `goals`.
+            goals: (n, goal size), finite, in the order of `ids`; units and frame as in `goals`.
             ids: The n simulations; None for all.
         """
         selected = self._select(ids)
@@ -373,42 +377,42 @@ class Simulation:
 
     @property
     def varies_physics(self) -> bool:
-        """True if the physics of an episode may differ from `model`."""
+        """True if disturbances may change the physics of an episode."""
         return self._disturber is not None and self._disturber.varies_physics
 
     def variation(self, index: int) -> dict[str, float]:
-        """Return what the running episode of a simulation drew from its disturbances."""
+        """Return the values, by name, that disturbances drew for the running episode; {} if off."""
         index = self._index(index)
         if self._disturber is None:
             return {}
         return {name: float(values[index]) for name, values in self._disturber.variations.items()}
 
     def readings(self) -> Readings:
-        """Return what the sensors measure now, (N, topic.size) for each topic, fresh arrays."""
+        """Return sensor readings in new arrays, (N, topic.size) for each topic."""
         return self.true_readings() if self._disturber is None else self._disturber.readings()
 
     def true_readings(self) -> Readings:
-        """Return what undisturbed sensors would measure, as `readings`."""
+        """Return the readings of undisturbed sensors, in the form of `readings`."""
         disturber = self._disturber
         return self._task.readings() if disturber is None else disturber.true_readings()
 
     def observe(self) -> Observation:
-        """Return the observation now, fresh arrays."""
+        """Return the present observation in new arrays."""
         if self._disturber is None:
             return self._sensed(*self._task.observe())
         sensed, _ = self._task.observe_from(self._disturber.readings())
         return self._sensed(sensed, achieved_goal(self.spec, self._disturber.true_readings()))
 
     def observe_from(self, readings: Readings) -> Observation:
-        """Return the observation that follows from the result of `readings`."""
+        """Return the observation computed from sensor readings, a result of `readings`."""
         return self._sensed(*self._task.observe_from(readings))
 
     def __copy__(self) -> Simulation:
-        """Copy like `copy.deepcopy`: copies share neither physics nor generators."""
+        """Return a deep copy, so that copies share neither physics nor random generators."""
         return copy.deepcopy(self)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return arguments and complete state, for `pickle` and `copy.deepcopy`."""
+        """Return constructor arguments and complete state, for `pickle` and `copy.deepcopy`."""
         return {
             'arguments': {
                 'task': self.spec.name,
@@ -448,7 +452,7 @@ class Simulation:
     def _each_given(
         self, name: str, given: Any, ids: NDArray[np.intp], read: Callable[[Any], _Read]
     ) -> dict[int, _Read]:
-        """Parse the argument `name` of `reset`; return values by index of the simulation.
+        """Parse the argument `name` of `reset` with `read`; return the values by simulation index.
 
         Simulations without a value are left out.
         """
@@ -476,9 +480,12 @@ class Simulation:
         given: Mapping[int, Mapping[str, float]] = MappingProxyType({}),
         starts: Mapping[int, StartState] = MappingProxyType({}),
     ) -> None:
-        """Begin episodes of simulations `ids`: state and physics first, then goals.
+        """Start episodes of simulations `ids`.
 
-        The user may give values of disturbances and start states by simulation.
+        Args:
+            ids: Sorted indices, (n,).
+            given: Variations that the user sets, by simulation and name.
+            starts: Start states that the user sets, by simulation.
         """
         self._require_threads()
         own = [self.generator(i) for i in ids.tolist()]
@@ -501,7 +508,7 @@ class Simulation:
         self._is_started[ids] = True
 
     def _sensed(self, observation: Array, achieved_goal: Array) -> Observation:
-        """Return the observation as a dictionary of fresh arrays."""
+        """Return the observation as a dictionary, with a copy of the desired goals."""
         return {
             'observation': observation,
             'achieved_goal': achieved_goal,
@@ -541,19 +548,19 @@ class Simulation:
         return diverged
 
     def _result(self, diverged: NDArray[np.bool_]) -> StepResult:
-        """Observe and evaluate; reward and success follow from the true state."""
+        """Return the result of a step; reward and success follow the true state."""
         observation = self.observe()
         reward, success = self.metric.evaluate(observation['achieved_goal'], self.goals)
         return StepResult(observation, reward, success, diverged)
 
     @property
     def _pushes(self) -> Array:
-        """External wrenches on the bodies, (N, bodies, 6): a view, so writing applies them."""
+        """External wrenches on the bodies, (N, bodies, 6); MuJoCo applies values written here."""
         pushes: Array = self._task.batch.bind('xfrc_applied')
         return pushes
 
     def _require_threads(self) -> None:
-        """Raise an error in a forked process, where waiting for the threads would never end."""
+        """Raise RuntimeError in a forked process, which lacks the threads of the batch."""
         if self._process != os.getpid() and self._task.batch.nthread > 1:
             raise RuntimeError(
                 'this process was forked and lacks the threads of the batch: create the batch '
@@ -565,7 +572,7 @@ class Simulation:
         return finite_numbers(name, values, shape)
 
     def _fitting(self, data: Any) -> Any:
-        """Return `data`; raise ValueError if its model has other sizes than ours."""
+        """Return `data`; raise ValueError unless it is an `MjData` that fits `model`."""
         shape = (self.model.nq,)
         if not isinstance(data, mujoco.MjData) or data.qpos.shape != shape:
             raise ValueError(

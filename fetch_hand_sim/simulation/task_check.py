@@ -31,7 +31,7 @@ def check_task(name: str) -> None:
 
     Raises:
         ValueError: If the task is invalid; the message names the first problem and its remedy.
-            Exceptions of the task's own code are passed on.
+            Exceptions raised in the code of the task are not caught.
     """
     for is_met, problem in _rules(task_spec(name)):
         if not is_met:
@@ -79,7 +79,7 @@ def _specification(spec: TaskSpec) -> Rules:
 
 
 def _model(task: Task) -> Rules:
-    """Check the model: its file, and the free joint of the object, which pictures and /tf use."""
+    """Check that the object has a free joint, and that pictures show the simulated model."""
     name = task.spec.object_name
     yield (
         name is None or task.object_qpos is not None,
@@ -109,7 +109,7 @@ def _sensors(task: Task) -> Rules:
 
 
 def _formulas(task: Task) -> Rules:
-    """Check that formulas accept any leading axes and work row by row."""
+    """Check that formulas accept any leading axes and compute each row from that row alone."""
     spec = task.spec
     rows = task.readings(spec.observed_topics)
     for topic in sensor_topics(spec):
@@ -147,7 +147,7 @@ def _rewards(simulation: Simulation) -> Rules:
 
 
 def _resets(simulation: Simulation) -> Rules:
-    """Check that equal seeds give equal episodes, and a reset changes no other simulation."""
+    """Check that equal seeds give equal episodes, and that a reset changes no other simulation."""
     size = simulation.spec.robot.action_size
     simulation.reset(seed=[0, 1])
     first = _all_sensors(simulation)

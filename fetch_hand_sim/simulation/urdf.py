@@ -41,13 +41,13 @@ _FAR, _STRONG, _FAST = 1000.0, 1000.0, 100.0
 
 @dataclass(frozen=True, slots=True)
 class Pose:
-    """Pose of a frame in another one: position (3,) m and quaternion (4,) wxyz."""
+    """Pose of a frame relative to another one: position (3,) m and quaternion (4,) wxyz."""
 
     position: Array
     quaternion: Array
 
     def __matmul__(self, other: Pose) -> Pose:
-        """Return the pose of a frame that has the pose `other` in this one."""
+        """Compose two poses: `other` is relative to the frame of this pose."""
         rotated = quaternion_to_matrix(self.quaternion) @ other.position
         turned = quaternion_multiply(self.quaternion, other.quaternion)
         return Pose(self.position + rotated, turned / np.linalg.norm(turned))
@@ -55,13 +55,13 @@ class Pose:
 
 @dataclass(frozen=True, slots=True)
 class UrdfJoint:
-    """Connection of two links.
+    """A joint between two links.
 
     Attributes:
         name: As in `joint_states`; fixed joints have the name of the child link and `/fixed`.
         kind: Joint type of URDF.
-        origin: Pose of the child in the parent at position 0.
-        axis: (3,) in the child.
+        origin: Pose of the child relative to the parent at joint position 0.
+        axis: (3,) axis of the joint in the frame of the child.
     """
 
     name: str
@@ -74,7 +74,7 @@ class UrdfJoint:
     upper: float = 0.0
 
     def pose(self, position: float = 0.0) -> Pose:
-        """Return the pose of the child in the parent at a position, rad or m."""
+        """Return the pose of the child relative to the parent at a joint position, rad or m."""
         if self.kind == 'fixed':
             return self.origin
         if self.kind == 'prismatic':
@@ -95,7 +95,7 @@ class RobotDescription:
         self.joints = [joint for body in self._bodies for joint in self._joints_of(body)]
 
     def poses(self, positions: Mapping[str, float]) -> dict[str, Pose]:
-        """Return the pose of each link in the root, for joint positions by name, rad or m."""
+        """Return the pose of each link in the root for joint positions, rad or m; 0 if missing."""
         found = {ROOT: Pose(np.zeros(3), IDENTITY)}
         for joint in self.joints:
             found[joint.child] = found[joint.parent] @ joint.pose(positions.get(joint.name, 0.0))
@@ -121,7 +121,7 @@ class RobotDescription:
         return ElementTree.tostring(robot, encoding='unicode')
 
     def _belongs(self, body: int) -> bool:
-        """Return whether a body is part of the robot; mocap bodies and room cameras are not."""
+        """Return whether a body is part of the robot; mocap bodies and external cameras are not."""
         model = self._model
         name = model.body(body).name
         is_mocap = int(model.body_mocapid[body]) >= 0
@@ -196,7 +196,7 @@ class RobotDescription:
 
 
 def numbers(values: ArrayLike) -> str:
-    """Return numbers as text for URDF."""
+    """Return numbers as text for URDF, separated by spaces."""
     return ' '.join(f'{value:.12g}' for value in np.asarray(values, dtype=np.float64))
 
 
@@ -220,7 +220,7 @@ def add_shapes(
 def _shapes(
     mjcf: mujoco.MjSpec, model: mujoco.MjModel, geom: int
 ) -> Iterator[tuple[ElementTree.Element, Array, Array]]:
-    """Yield shapes of a geom and their poses in the body; a capsule becomes three shapes."""
+    """Yield (element, position, quaternion) of a geom's shapes in its body; three for a capsule."""
     position, quaternion = model.geom_pos[geom].copy(), model.geom_quat[geom].copy()
     size = model.geom_size[geom]
     kind = int(model.geom_type[geom])
@@ -246,7 +246,7 @@ def _sphere(radius: float) -> ElementTree.Element:
 def _mesh(
     mjcf: mujoco.MjSpec, model: mujoco.MjModel, mesh: int, position: Array, quaternion: Array
 ) -> tuple[ElementTree.Element, Array, Array]:
-    """Return the file of a mesh with its pose; MuJoCo has moved the mesh to its inertia frame."""
+    """Return a mesh element with its pose, without MuJoCo's shift to the inertia frame."""
     source: Any = mjcf.mesh(model.mesh(mesh).name)
     path = (Path(mjcf.modelfiledir) / mjcf.meshdir / source.file).resolve()
     back = np.array([1.0, -1.0, -1.0, -1.0]) * model.mesh_quat[mesh]
@@ -262,14 +262,14 @@ def _add_color(element: ElementTree.Element, model: mujoco.MjModel, geom: int) -
 
 
 def add_origin(element: ElementTree.Element, position: ArrayLike, quaternion: ArrayLike) -> None:
-    """Add an `origin` with URDF's roll, pitch and yaw."""
+    """Add an `origin` element with position, roll, pitch and yaw."""
     ElementTree.SubElement(
         element, 'origin', xyz=numbers(position), rpy=numbers(roll_pitch_yaw(quaternion))
     )
 
 
 def roll_pitch_yaw(quaternion: ArrayLike) -> Array:
-    """Return URDF's angles (3,), rad, of a quaternion wxyz: R = Rz(yaw) Ry(pitch) Rx(roll)."""
+    """Return (roll, pitch, yaw), rad, of a quaternion wxyz: R = Rz(yaw) Ry(pitch) Rx(roll)."""
     m = quaternion_to_matrix(quaternion)
     cosine = np.hypot(m[0, 0], m[1, 0])
     if cosine > 1e-9:

@@ -1,4 +1,4 @@
-"""Batches of simulations for the tasks of `msgs_spec.tasks`."""
+"""Simulate batches of the tasks of `msgs_spec.tasks`."""
 
 from __future__ import annotations
 

@@ -1,9 +1,9 @@
 """The four Fetch tasks: a mocap-driven gripper, with or without an object.
 
-Equal to `fetch_env.py` of Gymnasium-Robotics 1.4.2 bit for bit, including its quirks. Positions are
-those of the last substep, unless the gripper is blocked: then a forward pass refreshes them.
-Velocities combine the Jacobian of these positions with the newest qvel. Each action anchors the
-mocap body at the lagged gripper pose.
+Trajectories equal those of `fetch_env.py` of Gymnasium-Robotics 1.4.2 bit for bit. As there, poses
+of bodies and sites lag the state by one substep, except in tasks with a blocked gripper, where a
+forward pass updates them. Velocities combine the Jacobian of these poses with the newest qvel. Each
+action moves the mocap body relative to the lagged gripper pose.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class FetchConfig:
 
     Attributes:
         start: Initial positions of robot0:slide0, slide1, slide2.
-        object_start: Initial qpos of the object, or None.
+        object_start: Initial qpos of the object; None without an object.
         block_gripper: Whether each step shuts the fingers. At the reset they are open by less than
             1 mm, as in Gymnasium-Robotics.
         gripper_extra_height: Added to the start height of the gripper.
@@ -122,13 +122,13 @@ FETCH_CONFIGS = {
 class FetchTask(Task):
     """FetchReach, FetchPush, FetchSlide, FetchPickAndPlace.
 
-    The robot settles once; every episode starts from that state.
+    The constructor moves the robot to its start pose; every episode starts from that state.
 
     Attributes:
         gripper_start: (3,) position of the gripper at a reset, m, world.
         object_height: Height of the object's centre at a reset, m; only with an object.
-        gripper_rotation: (N, 4) present rotation of the gripper, wxyz, live and read-only.
-        lead_scale: Factor of gripper steps that keeps the speed at rates other than 25 Hz.
+        gripper_rotation: (N, 4) present rotation of the gripper, wxyz; a read-only view.
+        lead_scale: Factor of the gripper offset per action, which keeps the speed at all rates.
     """
 
     def __init__(
@@ -161,7 +161,7 @@ class FetchTask(Task):
         self.batch.state[:] = self.start_state
 
     def _add_site(self, name: str, site: int) -> None:
-        """Add sensors of the pose (N, 7) and the velocity (N, 6) of a site, in world axes."""
+        """Add the sensors `<name>_pose` (N, 7) and `<name>_twist` (N, 6) of a site; world axes."""
         turn = self.model.site_quat[site].copy()
         is_aligned = bool((turn == [1.0, 0.0, 0.0, 0.0]).all())
         position: Array = self.output('site_xpos')[:, site]
@@ -180,7 +180,7 @@ class FetchTask(Task):
         self._sensors |= {f'{name}_pose': pose, f'{name}_twist': twist}
 
     def _settle(self, model: mujoco.MjModel, spec: TaskSpec) -> None:
-        """Drive the gripper to its start and store the state after a reset."""
+        """Move the gripper to its start position; store the state in which episodes start."""
         config = self.config
         data = mujoco.MjData(model)
         for joint, value in zip(spec.robot.joints[:3], config.start, strict=True):
@@ -207,7 +207,7 @@ class FetchTask(Task):
         return self.config.asset
 
     def reset(self, ids: Ids, generators: Generators) -> Array:
-        """Restore the settled state of simulations `ids`, place their objects; return new goals."""
+        """Restore the start state of simulations `ids`, place objects and return new goals."""
         self.batch.state[ids] = self.start_state
         if self.object_qpos is not None:
             places = [self._sample_object_place(generator) for generator in generators]
@@ -225,7 +225,7 @@ class FetchTask(Task):
         return place
 
     def sample_goal(self, index: int, generator: np.random.Generator) -> Array:
-        """Draw a point around the gripper's start, on the table or, for some tasks, above it."""
+        """Draw a goal near the gripper's start position; with an object, on the table or above."""
         config = self.config
         reach = config.target_range
         goal = self.gripper_start + generator.uniform(-reach, reach, size=3)
@@ -237,7 +237,7 @@ class FetchTask(Task):
         return np.asarray(goal)
 
     def apply_commands(self, commands: NDArray[np.floating]) -> None:
-        """Move the mocap target by 0.05 m per unit (at 25 Hz) and set the finger actuators.
+        """Set the mocap target, 0.05 m per unit of command at 25 Hz, and the finger actuators.
 
         The offset is scaled in the floating type of the command, as in the reference.
         """
@@ -248,7 +248,7 @@ class FetchTask(Task):
         self.move_gripper(offset, self.gripper_rotation + _GRIPPER_ROTATION)
 
     def move_gripper(self, offset: NDArray[np.floating], rotation: Array) -> None:
-        """Set the mocap target: offset from the gripper (N, 3), m, and quaternion (N, 4) wxyz."""
+        """Set the mocap target: offset (N, 3) from the gripper, m, and rotation (N, 4) wxyz."""
         self._mocap_pos[:, 0] = self._gripper_xpos + offset
         self._mocap_quat[:, 0] = rotation
 
@@ -257,7 +257,7 @@ class FetchTask(Task):
         return np.zeros((self.batch.nsim, self.spec.robot.action_size))
 
     def _finger_controls(self, fingers: NDArray[np.floating] | float) -> Array:
-        """Return actuator targets, which are relative to the present finger positions."""
+        """Return actuator targets; those of position actuators are relative to the fingers."""
         model = self.model
         controls = np.broadcast_to(fingers, self._ctrl.shape).astype(np.float64)
         relative = np.flatnonzero(model.actuator_biastype != mujoco.mjtBias.mjBIAS_NONE)
@@ -266,10 +266,10 @@ class FetchTask(Task):
         return controls
 
     def step(self) -> None:
-        """Advance one tick; a blocked gripper is then shut, with a forward pass.
+        """Advance one tick; then shut the fingers of a blocked gripper and run a forward pass.
 
-        The pass only computes positions unless `MjData` is kept. Models with a blocked gripper have
-        no actuators and therefore no efforts.
+        The pass computes positions only, unless the batch has `keeps_data`. Models with a blocked
+        gripper have no actuators and therefore no efforts.
         """
         try:
             super().step()
@@ -281,16 +281,16 @@ class FetchTask(Task):
 
 
 def lead_scale(control_hz: float) -> float:
-    """Return the factor of gripper steps at an action frequency, Hz; exactly 1 at 25 Hz."""
+    """Return the factor of the gripper offset per action that keeps its speed at 25 Hz."""
     return _steady_speed(DEFAULT_CONTROL_HZ) / _steady_speed(control_hz)
 
 
 def _steady_speed(control_hz: float) -> float:
-    """Return the mean speed of the gripper per metre of step, 1/s, for constant commands.
+    """Return the mean speed of the gripper per metre of offset, 1/s, for constant commands.
 
-    The weld is a critically damped spring of frequency w. With x = w T, released at distance 1 with
-    speed w u, its distance after T is (1 - (u - 1) x) exp(-x). In the steady state, u is the same
-    at the beginning and at the end of a period.
+    The weld to the mocap body is a critically damped spring of frequency w. After a period T from
+    distance 1 and speed w u, the distance is (1 - (u - 1) x) exp(-x) with x = w T. In the steady
+    state, u is the same at the beginning and at the end of a period.
     """
     x = 1.0 / (control_hz * _TIME_CONSTANT)
     decay = math.exp(-x)

@@ -1,6 +1,6 @@
 """The base of the hand tasks (20 position actuators, 24 joints, 5 fingertips), and HandReach.
 
-HandReach equals `reach.py` of Gymnasium-Robotics 1.4.2.
+Trajectories of HandReach equal those of `reach.py` of Gymnasium-Robotics 1.4.2.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class HandTask(Task):
         self._sensors['fingertip_poses'] = HandTask._fingertip_poses
 
     def follow_model(self) -> None:
-        """Step with the present `model`.
+        """Use the changed `model` from now on.
 
         If the user has changed its `actuator_ctrlrange`, actions in [-1, 1] span the new range.
         """
@@ -66,19 +66,19 @@ class HandTask(Task):
             self._scaled_robot = replace(self.spec.robot, command=command)
 
     def commands_from_actions(self, actions: NDArray[np.floating]) -> NDArray[np.floating]:
-        """Return joint angles (N, 20), rad, of actions in [-1, 1]."""
+        """Map actions (N, 20) in [-1, 1] to joint angles (N, 20), rad."""
         return command_from_action(self._scaled_robot, actions)
 
     def apply_commands(self, commands: NDArray[np.floating]) -> None:
-        """Set the position actuators to absolute joint angles, rad."""
+        """Set the targets of the position actuators to joint angles (N, 20), rad."""
         self._ctrl[:] = commands
 
     def resting_commands(self) -> Array:
-        """Return the present targets of the actuators, rad."""
+        """Return the present targets of the actuators (N, 20), rad."""
         return self._ctrl.copy()
 
     def _fingertip_poses(self) -> Array:
-        """Return fingertip positions, m, and orientations wxyz (those of the bodies), (N, 35)."""
+        """Return positions, m, and body orientations, wxyz, of the five fingertips, (N, 35)."""
         positions = self._site_xpos[:, self._fingertip_sites]
         quaternions = self._xquat[:, self._fingertip_bodies]
         return np.concatenate([positions, quaternions], axis=2).reshape(self.batch.nsim, -1)
@@ -121,7 +121,7 @@ _INITIAL_QPOS = {
 
 
 class HandReachTask(HandTask):
-    """HandReach.
+    """HandReach, the task of moving the fingertips to given positions.
 
     Attributes:
         start_fingertips: (5, 3) positions of the fingertips at a reset, m, world.
@@ -149,7 +149,7 @@ class HandReachTask(HandTask):
         return self.sample_goals(ids, generators)
 
     def sample_goal(self, index: int, generator: np.random.Generator) -> Array:
-        """Draw a meeting point of thumb and one finger, or in one of ten cases the initial pose."""
+        """Draw a goal where thumb and one finger meet, or with probability 0.1 the initial pose."""
         fingers, thumb = list(FINGERTIPS[:-1]), len(FINGERTIPS) - 1
         finger = fingers.index(str(generator.choice(fingers)))
         meeting = self.palm + _MEETING_OFFSET

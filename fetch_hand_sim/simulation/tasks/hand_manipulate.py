@@ -1,8 +1,8 @@
 """The eight manipulation tasks: turn a block, an egg or a pen in the hand.
 
-Equal to a new instance of `manipulate.py` of Gymnasium-Robotics 1.4.2, with one correction. The
-reference does not restore controls and warm start between episodes, so later episodes with a seed
-differ from the first. Here every reset starts from the initial state.
+Trajectories equal those of a new environment of `manipulate.py` of Gymnasium-Robotics 1.4.2. That
+code does not restore controls and warm start between episodes, so later episodes with a seed differ
+from the first. Here every reset starts from the initial state.
 """
 
 from __future__ import annotations
@@ -47,7 +47,8 @@ class ManipulateConfig:
     """Differences between the manipulation tasks.
 
     Attributes:
-        target_rotation: Rotations of goals: about z, about z on any face, or any.
+        target_rotation: Rotations of goals. `z`: about the z axis. `parallel`: about the z axis,
+            with any face up. `xyz`: about any axis.
         randomizes_rotation: Whether the object starts with a random rotation.
     """
 
@@ -111,8 +112,8 @@ class HandManipulateTask(HandTask):
     def reset(self, ids: Ids, generators: Generators) -> Array:
         """Drop the object on the palm until it stays there, then draw goals.
 
-        A failed or diverged attempt is repeated with the same controls and warm start, as in the
-        reference. An object that never stays, as in a changed model, raises RuntimeError.
+        Attempts that diverge or let the object fall are repeated with the same controls and warm
+        start, as in Gymnasium-Robotics. After `_MOST_TRIES` attempts, RuntimeError is raised.
         """
         self.batch.state[ids] = self.start_state
         generator_of = dict(zip(ids.tolist(), generators, strict=True))
@@ -129,7 +130,7 @@ class HandManipulateTask(HandTask):
         raise RuntimeError(f'{self.spec.name}: the object fell off the palm {_MOST_TRIES} times')
 
     def _settle(self, ids: Ids) -> NDArray[np.bool_]:
-        """Let objects come to rest; return which simulations diverged, (N,)."""
+        """Let objects come to rest; return flags (N,) of diverged simulations."""
         self.take_diverged()
         failed = np.zeros(self.batch.nsim, dtype=np.bool_)
         for advance in (partial(self.batch.step, nstep=self._settling), self.batch.forward):
@@ -146,7 +147,7 @@ class HandManipulateTask(HandTask):
         self.batch.forward(ids)
 
     def _sample_start(self, generator: np.random.Generator) -> Array:
-        """Draw the start pose of the object, (7,)."""
+        """Draw the start pose (7,) of the object."""
         position, quaternion = self._object_start[:3].copy(), self._object_start[3:]
         if self.config.randomizes_rotation:
             offset = self._sample_rotation(generator)
@@ -155,7 +156,7 @@ class HandManipulateTask(HandTask):
         return np.concatenate([position, quaternion / np.linalg.norm(quaternion)])
 
     def _sample_rotation(self, generator: np.random.Generator) -> Array:
-        """Draw a rotation of the task's kind, a quaternion wxyz (4,)."""
+        """Draw a rotation as `target_rotation` of the task prescribes, quaternion wxyz (4,)."""
         angle = generator.uniform(-np.pi, np.pi)
         if self.config.target_rotation == 'xyz':
             axis = generator.uniform(-1.0, 1.0, size=3)
@@ -167,7 +168,7 @@ class HandManipulateTask(HandTask):
         return quaternion_multiply(about_z, faces[generator.integers(len(faces))])
 
     def sample_goal(self, index: int, generator: np.random.Generator) -> Array:
-        """Draw a pose: the present one, shifted for some tasks, and rotated."""
+        """Draw a goal pose: the present position, shifted if it counts, and a random rotation."""
         position = self._object_qpos[index, :3].copy()
         if self.spec.position_counts:
             position += generator.uniform(TARGET_RANGE[:, 0], TARGET_RANGE[:, 1])
@@ -175,18 +176,18 @@ class HandManipulateTask(HandTask):
         return np.concatenate([position, quaternion / np.linalg.norm(quaternion)])
 
     def _object_twist(self) -> Array:
-        """Return the object's velocity in world axes, (N, 6); qvel has angular object axes."""
+        """Return the object's velocity (N, 6) in world axes; in qvel, rotation has object axes."""
         rotation = quaternion_to_matrix(self._object_qpos[:, 3:])
         angular = np.einsum('nij,nj->ni', rotation, self._object_qvel[:, 3:])
         return np.concatenate([self._object_qvel[:, :3], angular], axis=1)
 
     def _object_joint(self) -> Array:
-        """Return qpos and qvel of the free joint, (N, 13)."""
+        """Return qpos and qvel of the object's free joint, (N, 13)."""
         return np.concatenate([self._object_qpos, self._object_qvel], axis=1)
 
 
 def _parallel_rotations() -> Array:
-    """Return the 24 rotations of a cube to itself, Euler xyz (24, 3), in the reference's order."""
+    """Return the 24 rotations that map a cube to itself, Euler xyz (24, 3), in reference order."""
     quarter = np.pi / 2
     products = list(itertools.product([0.0, quarter, -quarter, np.pi], repeat=3))
     turns = np.round(quaternion_to_euler(euler_to_quaternion(products)) / quarter)

@@ -24,7 +24,7 @@ _FAMILIES: dict[str, type[Task]] = {
 
 
 def make_task(name: str, batch: BatchConfig | None = None) -> Task:
-    """Compile the model of a task and start its simulations.
+    """Compile the model of a task and create its batch of simulations.
 
     Raises:
         ValueError: If the task is unknown or the rate is not allowed. For third-party tasks also if

@@ -1,6 +1,6 @@
 """Base class of the tasks: reset, command, step and observe a batch of simulations.
 
-Also sets up MuJoCo: its warnings, timers, divergence counters and the threads of its batches.
+Also redirects MuJoCo's warnings, stops its timers and handles batches in forked processes.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ def _stop_timers() -> None:
 
 
 def keep_in_forks(batch: Batch) -> None:
-    """Keep a batch alive in forked processes until they end."""
+    """Never free a batch with threads in forked processes, which lack these threads."""
     if batch.nthread > 1:
         _THREADED.add(batch)
 
@@ -100,7 +100,7 @@ Generators = Sequence[np.random.Generator]
 
 @dataclass(frozen=True, slots=True)
 class BatchConfig:
-    """Size of a batch of simulations, and how it is stepped; see `Simulation`."""
+    """Size and settings of a batch of simulations; fields as the arguments of `Simulation`."""
 
     num_envs: int = 1
     num_threads: int = 0
@@ -120,19 +120,19 @@ class BatchConfig:
 
 
 class Task(ABC):
-    """One task on a batch of simulations; all arrays have the simulation as leading axis.
+    """A batch of simulations of one task; the first axis of all arrays is the simulation.
 
     Attributes:
         model: The compiled `mujoco.MjModel`; the batch steps with a copy.
-        pairs: Listed contact pairs, which follow changes of their geoms.
+        pairs: Listed contact pairs; `follow_model` updates them after changes of their geoms.
         substeps: Physics steps per action.
         tick_duration: Simulated seconds per action.
         draws_goals: Whether `reset` draws goals; otherwise they are zero until the user sets them.
         start_state: (state size,) `mjSTATE_INTEGRATION` before start and goal are drawn.
-        joint_qpos: Places of the robot's joints in qpos, (joints,).
-        joint_dofs: Places of their velocities in qvel, (joints,).
-        object_qpos: The seven places of the object's free joint in qpos; None without an object.
-        object_qvel: Its six places in qvel.
+        joint_qpos: Indices of the robot's joints in qpos, (joints,).
+        joint_dofs: Indices of the robot's joints in qvel, (joints,).
+        object_qpos: Slice of the object's free joint in qpos, 7 values; None without an object.
+        object_qvel: Slice of the object's free joint in qvel, 6 values; None without an object.
         ASSET: MJCF asset, for classes whose tasks share one.
     """
 
@@ -180,7 +180,7 @@ class Task(ABC):
 
         Args:
             ids: Sorted simulation indices, (n,).
-            generators: One generator per index; draws have the order of the reference.
+            generators: One per index; the order of draws is that of Gymnasium-Robotics.
         """
 
     @abstractmethod
@@ -195,12 +195,12 @@ class Task(ABC):
         return np.array([self.sample_goal(index, generator) for index, generator in pairs])
 
     def commands_from_actions(self, actions: NDArray[np.floating]) -> NDArray[np.floating]:
-        """Return the commands of actions (N, action size) in [-1, 1]."""
+        """Map actions (N, action size) in [-1, 1] to commands of the same shape."""
         return command_from_action(self.spec.robot, actions)
 
     @abstractmethod
     def apply_commands(self, commands: NDArray[np.floating]) -> None:
-        """Write commands (N, action size), in command units and within limits, to the physics."""
+        """Set the actuators or mocap targets for commands (N, action size) within the limits."""
 
     @abstractmethod
     def resting_commands(self) -> Array:
@@ -211,7 +211,7 @@ class Task(ABC):
         return GoalMetric(self.spec, success_rule, reward_type)
 
     def take_diverged(self) -> NDArray[np.bool_]:
-        """Return which simulations diverged since the last call, (N,)."""
+        """Return flags (N,) of the simulations that diverged since the last call."""
         # The last axis is (last info, number).
         warning = self.batch.warning
         first, second, third = (warning[:, kind, 1] for kind in _THROWN_AWAY)
@@ -226,22 +226,22 @@ class Task(ABC):
         self.batch.step(nstep=self.substeps)
 
     def follow_model(self) -> None:
-        """Step with the present `model` and time step; listed contacts follow their geoms."""
+        """Use the changed `model` from now on: physics, time step and listed contact pairs."""
         self.pairs.follow(self.model)
         self.batch.set_models(self.model)
         self.tick_duration = self.substeps * float(self.model.opt.timestep)
 
     def take_model(self, model: mujoco.MjModel, pairs: ListedPairs) -> None:
-        """Step with a changed model and its `pairs`."""
+        """Replace the model and its listed contact pairs."""
         self.batch.set_models(model)
         self.batch.get_model(0, self.model)
         self.pairs = pairs
         self.follow_model()
 
     def output(self, name: str) -> Array:
-        """Return a derived field of `MjData`, (N, ...), live and read-only: `xpos`, `cdof`, ...
+        """Return a read-only view (N, ...) of a derived field of `MjData`, such as `xpos`.
 
-        Sensors of the model are off until `sensordata` is requested.
+        Sensors of the model are disabled until `sensordata` is requested.
         """
         if name == 'sensordata':
             self.model.opt.disableflags &= ~mujoco.mjtDisableBit.mjDSBL_SENSOR.value
@@ -254,8 +254,8 @@ class Task(ABC):
 
         Args:
             name: One of `msgs_spec.topics.sensor_topics`.
-            function: Returns the present vectors (N, topic.size) in a new array. A method of the
-                task does not keep the task alive.
+            function: Returns the present vectors (N, topic.size) in a new array. A method of this
+                task is stored without a reference to the task.
         """
         allowed = [topic.name for topic in sensor_topics(self.spec)]
         if name not in allowed:
@@ -272,7 +272,7 @@ class Task(ABC):
         return tuple(self._sensors)
 
     def physics_state(self) -> dict[str, Array]:
-        """Return copies of the state (N, state size) and of the derived fields that are read.
+        """Return copies of the state (N, state size) and of the derived fields of `output`.
 
         After a step, the derived fields (N, ...) are one substep older than the state.
         """
@@ -280,7 +280,7 @@ class Task(ABC):
         return {'state': self.batch.state.copy(), **outputs}
 
     def set_physics_state(self, state: dict[str, Array]) -> None:
-        """Continue from a result of `physics_state`, to the same bits."""
+        """Restore a result of `physics_state`, bit for bit."""
         self.batch.state[:] = state['state']
         # Fills the `MjData` that simulations keep, but changes the warm start.
         self.batch.forward()
@@ -289,7 +289,7 @@ class Task(ABC):
             self._write_output(name, slice(None), state[name])
 
     def new_data(self, state: Array) -> mujoco.MjData:
-        """Return an `MjData` in a state (state size,), without derived values."""
+        """Return a new `MjData` in a state (state size,), without derived values."""
         data = mujoco.MjData(self.model)
         mujoco.mj_setState(self.model, data, state, mujoco.mjtState.mjSTATE_INTEGRATION.value)
         return data
@@ -297,7 +297,8 @@ class Task(ABC):
     def read_data(self, index: int, data: mujoco.MjData) -> None:
         """Copy the state of simulation `index` into `data`.
 
-        Values that MuJoCo derives from the state, such as contacts, are copied with `keeps_data`.
+        With `keeps_data`, all values that MuJoCo derives from the state, such as contacts, are
+        copied, too.
         """
         self.batch.get_data(index, data)
         # The `MjData` of a copy that has not stepped yet is newer than the task's outputs.
@@ -305,7 +306,7 @@ class Task(ABC):
             getattr(data, name)[:] = values[index]
 
     def write_data(self, index: int, data: mujoco.MjData) -> None:
-        """Continue simulation `index` from `data`, as if it had computed `data` itself."""
+        """Set the state and the derived fields of simulation `index` to those of `data`."""
         self.batch.state[index] = integration_state(self.model, data)
         for name in self._outputs:
             self._write_output(name, index, getattr(data, name))
@@ -318,7 +319,7 @@ class Task(ABC):
         output.flags.writeable = False
 
     def readings(self, names: Iterable[str] = ()) -> Readings:
-        """Return the present sensor readings of some topics, by default of all, in new arrays."""
+        """Return the present sensor readings of topics, by default of all, in new arrays."""
         return {name: self._sensors[name](self) for name in names or self._sensors}
 
     def observe(self) -> tuple[Array, Array]:
@@ -326,7 +327,7 @@ class Task(ABC):
         return self.observe_from(self.readings(self.spec.observed_topics))
 
     def observe_from(self, readings: Readings) -> tuple[Array, Array]:
-        """Return observations and achieved goals that follow from readings."""
+        """Return the observations and achieved goals computed from sensor readings."""
         goal = achieved_goal(self.spec, readings)
         return observation(self.spec, readings, self.tick_duration), goal
 
@@ -343,7 +344,7 @@ class Task(ABC):
 
 
 def _scalar_joint(spec: TaskSpec, model: mujoco.MjModel, name: str) -> Any:
-    """Return a hinge or slide joint of the model; raise ValueError, which lists all, otherwise."""
+    """Return a hinge or slide joint by name; raise ValueError, which lists all, if missing."""
     kinds = (mujoco.mjtJoint.mjJNT_SLIDE.value, mujoco.mjtJoint.mjJNT_HINGE.value)
     number = find(model, mujoco.mjtObj.mjOBJ_JOINT, name)
     if number < 0 or model.jnt_type[number] not in kinds:
@@ -356,7 +357,7 @@ def _scalar_joint(spec: TaskSpec, model: mujoco.MjModel, name: str) -> Any:
 
 
 def integration_state(model: mujoco.MjModel, data: mujoco.MjData) -> Array:
-    """Return `mjSTATE_INTEGRATION` of `data`, a row of `Batch.state`."""
+    """Return the state `mjSTATE_INTEGRATION` of `data`, the format of the rows of `Batch.state`."""
     spec = mujoco.mjtState.mjSTATE_INTEGRATION.value
     state = np.empty(mujoco.mj_stateSize(model, spec))
     mujoco.mj_getState(model, data, state, spec)
@@ -364,7 +365,7 @@ def integration_state(model: mujoco.MjModel, data: mujoco.MjData) -> Array:
 
 
 class SiteMotion:
-    """Velocity of a site for velocities of joints, as MuJoCo computed it in its last pass."""
+    """Maps joint velocities to the velocity of a site, by the Jacobian of MuJoCo's last pass."""
 
     def __init__(self, task: Task, site: int) -> None:
         model, body = task.model, int(task.model.site_bodyid[site])
@@ -385,8 +386,8 @@ class SiteMotion:
         The sum has a fixed order, so batches of any size give the same bits.
 
         Args:
-            dofs: Some of `dofs`, (n,).
-            velocity: Their velocities, (N, n).
+            dofs: Indices of degrees of freedom, (n,), all of them in the attribute `dofs`.
+            velocity: Velocities of these degrees of freedom, (N, n).
         """
         spatial = (self._cdof[:, dofs] * velocity[:, :, None]).sum(axis=1)
         angular, lever = spatial[:, :3], self._position - self._center
