@@ -1,4 +1,4 @@
-"""Disturbances of a robot as data: delays, noise, lost messages, other physics, pushes.
+"""Disturbances of a robot as data: delays, noise, lost commands, changed physics and pushes.
 
 Everything is off by default. Sources of the ranges are in `docs/robustness.md`.
 """
@@ -26,13 +26,13 @@ _LONGEST_FILE = 100_000
 
 @dataclass(frozen=True, slots=True)
 class Kind:
-    """Limits and meaning of a field.
+    """Limits and meaning of a field of a disturbance.
 
     Attributes:
-        off: The number that disturbs nothing.
-        is_range: Whether a value is a pair (lowest, highest) from which each episode draws; one
-            number n stands for (n, n).
-        is_factor: Whether a number multiplies, so that it is scaled and drawn on a log scale.
+        off: The value that switches the disturbance off.
+        is_range: Whether a value is a pair (lowest, highest), from which each episode draws a
+            number. A single number n then means (n, n).
+        is_factor: Whether the number is a factor, which is scaled and drawn on a log scale.
     """
 
     off: float
@@ -43,7 +43,7 @@ class Kind:
     is_factor: bool = False
 
     def checked(self, name: str, value: Any) -> Any:
-        """Return a value in its form, or raise ValueError with the allowed range."""
+        """Return a value as number or pair of this kind; raise ValueError if it is not allowed."""
         given = list(value) if self.is_range and isinstance(value, (list, tuple)) else [value]
         is_right = len(given) in (1, 1 + self.is_range) and all(
             isinstance(each, (int, float))
@@ -62,7 +62,7 @@ class Kind:
         return (numbers[0], numbers[-1]) if self.is_range else numbers[0]
 
     def scaled(self, value: Any, strength: float) -> Any:
-        """Return a value `strength` times as far from `off`, within the limits."""
+        """Return the value of a disturbance `strength` times as strong, within the limits."""
         if isinstance(value, tuple):
             return tuple(self.scaled(each, strength) for each in value)
         change = strength * (value - self.off)
@@ -70,7 +70,7 @@ class Kind:
         return min(max(value**strength if self.is_factor else moved, self.lowest), self.highest)
 
     def drawn(self, span: Span, share: float) -> float:
-        """Return the number of a range that is `share` of the way through it."""
+        """Return a number of the range `span`: its lower limit for `share` 0, its upper for 1."""
         lowest, highest = span
         if self.is_whole:
             return float(lowest + int(share * (highest - lowest + 1)))
@@ -95,7 +95,7 @@ def _off(kind: Kind) -> Any:
 
 @dataclass(frozen=True)
 class _Group:
-    """Checks and normalises its fields."""
+    """Base of the groups of disturbances; checks the fields and converts them by `Kind`."""
 
     def __post_init__(self) -> None:
         for each in fields(self):
@@ -105,7 +105,7 @@ class _Group:
 
 @dataclass(frozen=True)
 class ActionDisturbance(_Group):
-    """What happens to commands on their way to the motors.
+    """Errors of commands on their way to the motors.
 
     Attributes:
         latency: Delay, ticks.
@@ -113,7 +113,7 @@ class ActionDisturbance(_Group):
         drop: Probability per tick that a command is lost: the gripper stays, the hand keeps its
             targets.
         noise: Standard deviation of white noise, as a share of half the command range.
-        bias: Standard deviation of an offset that lasts an episode, likewise.
+        bias: Standard deviation of an offset that lasts an episode, as a share of the same range.
     """
 
     latency: Span = _off(TICKS)
@@ -152,7 +152,7 @@ class ObjectDisturbance(_Group):
         bias: Standard deviation of an offset that lasts an episode, per axis, m.
         rotation_noise: Standard deviation of white noise per axis, rad.
         rotation_bias: Standard deviation of an offset that lasts an episode, per axis, rad.
-        period: Ticks between two measurements; the last one is repeated meanwhile.
+        period: Ticks between two measurements; between them, the last one is repeated.
         stale: Probability per tick that a measurement is missing.
         lost: Probability per tick that tracking is lost for half a second.
     """
@@ -169,7 +169,7 @@ class ObjectDisturbance(_Group):
 
 @dataclass(frozen=True)
 class PhysicsDisturbance(_Group):
-    """Physics that differs from the model for an episode. Factors multiply the model's value.
+    """Physics that differs from the model during an episode; factors multiply model values.
 
     Attributes:
         friction: Factor of all sliding, torsional and rolling friction.
@@ -179,7 +179,7 @@ class PhysicsDisturbance(_Group):
         force_limit: Factor of the largest actuator force (hand).
         damping: Factor of the damping of the driven joints (hand).
         gravity_tilt: Angle between gravity and the vertical, rad; its direction is random.
-        table_height: Shift of the table and of what stands on it, m (Fetch).
+        table_height: Shift of the table and of the object on it, m (Fetch).
     """
 
     friction: Span = _off(FACTOR)
@@ -194,10 +194,10 @@ class PhysicsDisturbance(_Group):
 
 @dataclass(frozen=True)
 class PushDisturbance(_Group):
-    """Random pushes of one tick on the object, or on gripper or palm in tasks without an object.
+    """Random pushes of one tick; they act on the object, or without one on gripper or palm.
 
     Attributes:
-        force: Standard deviation per axis, as a share of the weight of what is pushed.
+        force: Standard deviation per axis, as a share of the weight of the pushed body.
         rate: Mean number of pushes per simulated second.
     """
 
@@ -207,7 +207,7 @@ class PushDisturbance(_Group):
 
 @dataclass(frozen=True)
 class StartDisturbance(_Group):
-    """Start states beyond those of the task.
+    """Random changes of the start states that the task draws.
 
     Attributes:
         object_position: Largest shift of the object, horizontally, per axis, m.
@@ -237,8 +237,8 @@ class Disturbances:
     def scaled(self, factor: float) -> Disturbances:
         """Return the disturbances `factor` times as strong.
 
-        Sizes, probabilities and delays are multiplied, delays are rounded; factors are raised to
-        the power of `factor`, so that 0.5 scaled by 2 is 0.25.
+        Sizes, probabilities and delays are multiplied by `factor`; delays are then rounded. Values
+        that are factors are raised to the power of `factor`: 0.5 scaled by 2 is 0.25.
         """
         groups = {}
         for group in fields(self):
@@ -251,7 +251,7 @@ class Disturbances:
         return dataclasses.replace(self, **groups)
 
     def as_dict(self) -> dict[str, dict[str, Any]]:
-        """Return what is not off, ready for JSON or YAML; `from_dict` reads it."""
+        """Return the values that are not off, for JSON or YAML; `from_dict` reads the result."""
         found: dict[str, dict[str, Any]] = {}
         for group in fields(self):
             for each in fields(getattr(self, group.name)):
@@ -262,12 +262,12 @@ class Disturbances:
         return found
 
     def to_json(self) -> str:
-        """Return `as_dict` as JSON text, which `read_disturbances` reads."""
+        """Return `as_dict` as JSON text, which `from_json` and `read_disturbances` read."""
         return json.dumps(self.as_dict())
 
     @classmethod
     def from_json(cls, text: str) -> Disturbances:
-        """Return the disturbances in the text of `to_json`, or raise ValueError."""
+        """Return the disturbances of a JSON text from `to_json`, or raise ValueError."""
         try:
             return cls.from_dict(json.loads(text))
         except RecursionError:
@@ -275,7 +275,7 @@ class Disturbances:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Disturbances:
-        """Return the disturbances in the result of `as_dict`, or raise ValueError."""
+        """Return the disturbances of a mapping from `as_dict`, or raise ValueError."""
         groups: dict[str, Any] = {each.name: type(each.default) for each in fields(cls)}
         found: dict[str, Any] = {}
         for name, given in entries('disturbances', values, list(groups)).items():
@@ -288,12 +288,12 @@ class Disturbances:
 
 
 def read_disturbances(given: str | Mapping[str, Any] | Disturbances | None) -> Disturbances:
-    """Return disturbances from any form in which a user may give them.
+    """Read disturbances in any form that users may give.
 
     Args:
-        given: A preset (`mild`, `hardware`, `severe`), scaled as in `hardware*0.5`. The path of a
-            JSON or YAML file. JSON text that begins with `{`. A mapping. `none` or None for no
-            disturbances. Other values raise ValueError.
+        given: A preset (`mild`, `hardware`, `severe`), optionally scaled (`hardware*0.5`); the path
+            of a JSON or YAML file; JSON text that begins with `{`; a mapping; or `none` or None for
+            no disturbances. Other values raise ValueError.
     """
     if given is None or given in ('', 'none', 'off'):
         return Disturbances()

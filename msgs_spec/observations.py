@@ -1,7 +1,7 @@
 """Formulas of the observation vectors.
 
-Simulation and policies call the same functions, so observations on ROS equal those of the training,
-bit for bit. The functions accept any leading batch shape, work element by element and return new
+Simulation and policies call the same functions, so observations on ROS equal those of training bit
+for bit. The functions accept any leading batch shape, work element by element and return new
 float64 arrays.
 """
 
@@ -46,9 +46,9 @@ def observation(task: TaskSpec, readings: Readings, tick_duration: float) -> Arr
 
 
 def _fetch_parts(task: TaskSpec, readings: Readings, tick_duration: float) -> list[Array]:
-    """Return the parts of `generate_mujoco_observations` in `fetch_env.py`.
+    """Return the observation parts of a Fetch task, in the order of `fetch_env.py`.
 
-    Its velocities are per tick, hence `tick_duration`.
+    Velocities are per tick: values per second are multiplied by `tick_duration`.
     """
     count, joints = len(task.robot.joints), readings['joint_states']
     fingers = joints[..., count - 2 : count]
@@ -92,9 +92,9 @@ def achieved_goal(task: TaskSpec, readings: Readings) -> Array:
 
 
 class ObservationAssembler:
-    """Computes the dict observation of a task from its topics of one stamp, or raises ValueError.
+    """Computes the observation dictionary of a task from the topics of one tick.
 
-    `control_hz` is in ticks per simulated second, as in `episode_status`.
+    `control_hz` is the number of ticks per simulated second, as in `episode_status`.
     """
 
     def __init__(self, task: TaskSpec, control_hz: float) -> None:
@@ -108,6 +108,9 @@ class ObservationAssembler:
 
         Args:
             vectors: Vectors (..., topic.size) by topic, with any leading axes, such as ticks.
+
+        Raises:
+            ValueError: If a topic is missing, or a value is not finite.
         """
         for name in (spec.name for spec in self.topics):
             if name not in vectors:

@@ -1,4 +1,4 @@
-"""Parameters of the nodes as data, and the check of their values."""
+"""Parameters of the nodes as data, checks of their values, and the help text of a node."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ _ROS_QOS = tuple(f'qos_overrides./{name}.' for name in ('clock', 'parameter_even
 
 @dataclass(frozen=True, slots=True)
 class ParameterSpec:
-    """One parameter.
+    """One parameter of a node.
 
     Attributes:
-        choices: Allowed strings; empty allows any.
+        choices: Allowed strings; if empty, any string is allowed.
         longest: Maximum number of characters; None for no limit.
-        or_zero: Whether 0 is allowed below `lower`, to switch something off.
-        read_only: Whether the value is fixed once the node runs.
+        or_zero: Whether 0 is allowed, too, although it is less than `lower`.
+        read_only: Whether the value cannot change while the node runs.
         check: Raises ValueError for invalid values within type and limits.
-        former: Former name, accepted with a warning.
-        is_path: Whether `~` stands for the home directory. No shell replaces it within
+        former: Former name of the parameter, which is accepted with a warning.
+        is_path: Whether the node replaces `~` by the home directory, because no shell does this in
             `<name>:=<value>`.
     """
 
@@ -55,7 +55,7 @@ class ParameterSpec:
 
     @property
     def allowed(self) -> str:
-        """Allowed values as text."""
+        """The allowed values as text, for messages and help."""
         if self.choices:
             return ', '.join(repr(choice) for choice in self.choices)
         if self.type == 'bool':
@@ -279,7 +279,7 @@ NODES = {
 
 
 def validate(spec: ParameterSpec, value: object) -> None:
-    """Raise ValueError, which names the allowed values, for an invalid value."""
+    """Raise ValueError if a value is not allowed; the message names the allowed values."""
     if not _is_allowed(spec, value):
         hint = did_you_mean(str(value), spec.choices)
         if spec.type == 'string' and not spec.choices and isinstance(value, (int, float)):
@@ -312,8 +312,8 @@ def _is_allowed(spec: ParameterSpec, value: object) -> bool:
 def unknown_parameter(specs: Sequence[ParameterSpec], name: str) -> str | None:
     """Return a warning about a parameter that a node does not have.
 
-    Returns None for parameters of ROS and of the other nodes, because one file of parameters often
-    serves several nodes.
+    Returns None for parameters of ROS and of the other nodes, because several nodes often share a
+    parameter file.
     """
     is_known = any(name in (spec.name, spec.former) for node in NODES.values() for spec in node)
     if is_known or name == 'use_sim_time' or name.startswith(_ROS_QOS):

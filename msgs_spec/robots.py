@@ -1,4 +1,4 @@
-"""Robot specifications: joints in order, commands in ROS units, normalised actions."""
+"""Robot specifications: order of joints, units and limits of commands, normalised actions."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ LONGEST_JOINT_PREFIX = 64
 
 @dataclass(frozen=True, slots=True)
 class CommandPart:
-    """One number of the command vector: an axis or a joint.
+    """One number of the command vector, for an axis or a joint.
 
     Attributes:
         lower: Smallest value after clipping.
@@ -39,13 +39,13 @@ class CommandPart:
 
 @dataclass(frozen=True, slots=True)
 class RobotSpec:
-    """A robot on the network.
+    """A robot as data: its joints and its command.
 
     Attributes:
         name: `fetch`, `shadow_hand`, or the name of a third-party robot.
         joints: Scalar joints, named and ordered as in `joint_states`.
         joint_units: 'm' or 'rad' for each joint.
-        command: Parts of the command, and of the normalised action.
+        command: Parts of the command; the normalised action has the same parts.
         has_gripper_command: Whether commands move a gripper and are dimensionless, as for Fetch.
             Otherwise they are absolute joint positions.
     """
@@ -67,7 +67,7 @@ class RobotSpec:
         return all(part.lower == -1.0 and part.upper == 1.0 for part in self.command)
 
     def with_joint_prefix(self, prefix: str) -> RobotSpec:
-        """Return the robot with another prefix of its joint names, such as `rh_`."""
+        """Return a copy whose joint names have the prefix `prefix`, such as `rh_`."""
 
         def renamed(name: str) -> str:
             is_joint = name.startswith(JOINT_PREFIX)
@@ -79,7 +79,7 @@ class RobotSpec:
 
 
 def read_joint_prefix(robot: RobotSpec, prefix: str) -> str:
-    """Return the prefix meant by the parameter; ValueError if it renames no joint."""
+    """Return the joint prefix for the parameter `joint_prefix`; ValueError if it has no effect."""
     if prefix in (MODEL_PREFIX, JOINT_PREFIX):
         return JOINT_PREFIX
     if robot.with_joint_prefix(prefix).joints == robot.joints:
@@ -174,8 +174,9 @@ def command_limits(robot: RobotSpec) -> tuple[Array, Array]:
 def command_from_action(robot: RobotSpec, action: ArrayLike) -> NDArray[Any]:
     """Map actions (..., action_size), clipped to [-1, 1], to commands of the same shape.
 
-    Fetch: the command is the action. Its floating type is kept, because Gymnasium-Robotics scales
-    it in that type. Other robots: -1 and 1 are the limits of the command, as in `hand_env.py`.
+    For Fetch, the command equals the action and keeps its floating type, because Gymnasium-Robotics
+    scales it in that type. For other robots, -1 and 1 map to the limits of the command, as in
+    `hand_env.py`.
     """
     clipped = np.asarray(np.clip(np.asarray(action), -1.0, 1.0))
     if robot.has_normalised_command:
@@ -195,7 +196,7 @@ def action_from_command(robot: RobotSpec, command: ArrayLike) -> Array:
 
 
 def resting_command(robot: RobotSpec) -> Array:
-    """Return the command of the zero action: the gripper stays, hand joints go mid-range."""
+    """Return the command of action 0: the gripper stays, hand joints move to mid-range."""
     return np.asarray(command_from_action(robot, np.zeros(robot.action_size)), dtype=np.float64)
 
 

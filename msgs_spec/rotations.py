@@ -1,8 +1,8 @@
 """Quaternions, matrices and Euler angles of any batch shape.
 
-Quaternions are wxyz as in MuJoCo, except inside ROS messages, which have xyzw. All functions work
-on new contiguous arrays and element by element, so that a batch has the same bits as one call per
-row. Euler angles follow the relative xyz convention of `gymnasium_robotics.utils.rotations`.
+Quaternions are wxyz as in MuJoCo; only ROS messages contain xyzw. All functions work on new
+contiguous arrays and element by element, so a batch gives the same bits as one call per row. Euler
+angles follow the relative xyz convention of `gymnasium_robotics.utils.rotations`.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _SINGULAR = 4.0 * np.finfo(np.float64).eps
 
 
 def _parts(array: ArrayLike) -> list[Any]:
-    """Return the components along the last axis, each a contiguous array."""
+    """Split an array along its last axis into contiguous arrays."""
     values = np.asarray(array, dtype=np.float64)
     return [np.array(values[..., index], order='C') for index in range(values.shape[-1])]
 
@@ -58,8 +58,8 @@ def quaternion_from_axis_angle(axis: ArrayLike, angle: ArrayLike) -> Array:
 def _length(vectors: Array) -> Array:
     """Return lengths (..., 1) of vectors (..., n), one `np.linalg.norm` per vector.
 
-    It calls BLAS, which on many processors rounds once less than a sum along an axis. With a sum,
-    one start state in eight would differ from Gymnasium-Robotics in its last bit.
+    `np.linalg.norm` of one vector calls BLAS, which rounds differently from a sum along an axis.
+    With a sum, one start state in eight would differ from Gymnasium-Robotics in the last bit.
     """
     rows = vectors.reshape(-1, vectors.shape[-1])
     lengths = np.array([np.linalg.norm(row) for row in rows])
@@ -67,9 +67,9 @@ def _length(vectors: Array) -> Array:
 
 
 def quaternion_to_matrix(quaternion: ArrayLike) -> Array:
-    """Return rotation matrices (..., 3, 3) of unit quaternions wxyz.
+    """Return rotation matrices (..., 3, 3) of unit quaternions wxyz (..., 4).
 
-    Equal to MuJoCo 4 (`mju_quat2Mat`) bit for bit, because the order of the sums is the same.
+    The result equals that of `mju_quat2Mat` in MuJoCo 4 bit for bit: sums have the same order.
     """
     w, x, y, z = _parts(quaternion)
     ww, wx, wy, wz = w * w, w * x, w * y, w * z
@@ -84,7 +84,7 @@ def quaternion_to_matrix(quaternion: ArrayLike) -> Array:
 
 
 def matrix_to_euler(matrix: ArrayLike) -> Array:
-    """Euler angles xyz (..., 3), radians, of rotation matrices (..., 3, 3)."""
+    """Return Euler angles xyz (..., 3), rad, of rotation matrices (..., 3, 3)."""
     values = np.asarray(matrix, dtype=np.float64)
     m = np.ascontiguousarray(np.moveaxis(values, (-2, -1), (0, 1)))
     cy = np.sqrt(m[2, 2] * m[2, 2] + m[1, 2] * m[1, 2])
@@ -127,7 +127,7 @@ def quaternion_to_euler(quaternion: ArrayLike) -> Array:
 
 
 def rotation_angle(first: ArrayLike, second: ArrayLike, antipodal: bool) -> Array:
-    """Return the angle between unit quaternions wxyz (..., 4), rad.
+    """Return the angles (...), rad, between unit quaternions wxyz (..., 4).
 
     If `antipodal`, q and -q are equal and angles are in [0, pi]. Otherwise q and -q are 2 pi apart
     and angles are in [0, 2 pi], as in Gymnasium-Robotics.

@@ -1,4 +1,4 @@
-"""Message definitions by ROS type name: schema text, type hash, CDR bytes.
+"""Message classes, schema texts, type hashes and CDR conversion by ROS type name.
 
 The definitions of ROS 2 Jazzy come from the `rosbags` package, so logs can be written and read
 without ROS.
@@ -38,31 +38,31 @@ def message_class(type_name: str) -> Any:
 
 @cache
 def schema_text(type_name: str) -> str:
-    """Return the `ros2msg` text of a type and its nested types, for MCAP."""
+    """Return the definition of a type and its nested types in format `ros2msg`, for MCAP."""
     message_class(type_name)
     return _store().generate_msgdef(type_name, ros_version=2)[0]
 
 
 @cache
 def type_hash(type_name: str) -> str:
-    """Return the type hash of REP 2016, `RIHS01_` and 64 hexadecimal digits."""
+    """Return the type hash of REP 2016: `RIHS01_` and 64 hexadecimal digits."""
     message_class(type_name)
     return _store().hash_rihs01(type_name)
 
 
 def require_short(data: bytes) -> None:
-    """Raise ValueError for more than `MAX_MESSAGE_BYTES`, which take longer than a tick to read."""
+    """Raise ValueError for messages above `MAX_MESSAGE_BYTES`; these take too long to decode."""
     if len(data) > MAX_MESSAGE_BYTES:
         raise ValueError(f'{len(data)} bytes given; allowed: up to {MAX_MESSAGE_BYTES}')
 
 
 def serialize(type_name: str, message: object) -> bytes:
-    """Return the CDR bytes (little endian, with header) of an instance of `message_class`."""
+    """Return a message, an instance of `message_class`, as little-endian CDR bytes with header."""
     return bytes(_store().serialize_cdr(message, type_name, little_endian=True))
 
 
 def deserialize(type_name: str, data: bytes) -> Any:
-    """Return the message in `data` as an instance of `message_class`, or raise ValueError."""
+    """Return the message in CDR bytes, an instance of `message_class`, or raise ValueError."""
     message_class(type_name)
     try:
         return _store().deserialize_cdr(data, type_name)

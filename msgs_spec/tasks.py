@@ -1,10 +1,10 @@
 """The tasks as data: goals, observations, lengths, thresholds.
 
-Thirteen come from Plappert et al. 2018. Other packages may add tasks by entry points: the group
-`fetch_hand_sim_tasks.specification` gives a `TaskSpec` of the entry point's name, without importing
-MuJoCo. An entry point of the same name in `fetch_hand_sim_tasks.simulation` gives the class that
-simulates the task. A broken package costs one warning and its own task;
-`fetch_hand_sim.simulation.check_task` finds subtle mistakes.
+Thirteen tasks come from Plappert et al. 2018. Other packages may add a task by two entry points
+with the name of the task. The one in group `fetch_hand_sim_tasks.specification` refers to a
+`TaskSpec`, in a module that does not import MuJoCo. The one in group
+`fetch_hand_sim_tasks.simulation` refers to the class that simulates the task. Invalid tasks are
+left out with a warning; `fetch_hand_sim.simulation.check_task` finds subtle mistakes.
 """
 
 from __future__ import annotations
@@ -74,8 +74,8 @@ class TaskFormulas:
 
     Attributes:
         topics: Topics that the formulas read.
-        observation: Readings and seconds of one control period -> (..., observation size).
-        achieved_goal: Readings -> (..., goal size).
+        observation: Function of readings and control period, s; returns (..., observation size).
+        achieved_goal: Function of readings; returns (..., goal size).
     """
 
     topics: tuple[str, ...]
@@ -91,17 +91,18 @@ class TaskSpec:
         observation: Parts of the observation vector, in order.
         episode_ticks: Steps per episode; in `TASKS` those at 25 Hz.
         object_name: `object0` (Fetch), `object` (hand), or None for tasks without an object.
-        distance_threshold: Success within this distance, m.
-        rotation_threshold: Success within this rotation, rad; None for goals without rotation.
+        distance_threshold: Success threshold of the distance, m.
+        rotation_threshold: Success threshold of the rotation, rad; None for goals without rotation.
         reference_id: Environment of Gymnasium-Robotics 1.4.2 that equals this task, or None.
-        achieved_goal: Part of the observation that is the achieved goal.
+        achieved_goal: Name of the observation part that is the achieved goal.
         position_counts: Whether the position of a pose goal counts (False for the Rotate tasks).
         ignores_z_rotation: Whether the rotation about the object's own z axis does not count (pen).
         object_symmetry: `cube`, or `revolution` for an object that looks the same when turned about
             its z axis or upside down; None unless goals are poses.
-        formulas: None for the thirteen tasks, and for tasks observed like one of them.
-        looks_like: The one of the thirteen tasks with the same camera view and goal region; a copy
-            by `dataclasses.replace` keeps it. None for the usual view of the robot.
+        formulas: Formulas of a third-party task; None if its observation is that of one of the
+            thirteen tasks.
+        looks_like: Name of one of the thirteen tasks, whose camera view and goal region this task
+            has. A copy by `dataclasses.replace` keeps it. None for the usual view of the robot.
     """
 
     name: str
@@ -149,7 +150,7 @@ class TaskSpec:
         return (*robot, 'object_pose', 'object_twist') if self.has_object else robot
 
     def with_joint_prefix(self, prefix: str) -> TaskSpec:
-        """Return the task with another prefix of its joint names."""
+        """Return a copy of the task whose joint names have the prefix `prefix`."""
         if prefix == JOINT_PREFIX:
             return self
         return replace(self, robot=self.robot.with_joint_prefix(prefix))
@@ -266,11 +267,12 @@ TASKS: dict[str, TaskSpec] = {
 def task_spec(
     name: str, joint_prefix: str = JOINT_PREFIX, control_hz: float = DEFAULT_CONTROL_HZ
 ) -> TaskSpec:
-    """Return a task, or raise ValueError, which lists all tasks.
+    """Return a task by name; raise ValueError, which lists all tasks, if it is unknown.
 
     Args:
         joint_prefix: Prefix of the joint names on the network.
-        control_hz: Action frequency, Hz. An episode keeps its duration; its steps are rounded.
+        control_hz: Action frequency, Hz. Episodes have the same duration at all frequencies; the
+            number of steps is rounded.
     """
     try:
         task = TASKS[name]
@@ -326,7 +328,10 @@ _PACKAGES: dict[str, str] = {}
 
 
 def third_party_tasks() -> dict[str, TaskSpec]:
-    """Return the third-party tasks by name; warn about each that is left out."""
+    """Return the tasks that entry points of installed packages add, by name.
+
+    A task that fails to load or is invalid is left out with a warning.
+    """
     tasks: dict[str, TaskSpec] = {}
     for entry_point in entry_points(group=SPECS):
         name = entry_point.name
@@ -341,7 +346,7 @@ def third_party_tasks() -> dict[str, TaskSpec]:
 
 
 def _accept(name: str, spec: Any) -> TaskSpec:
-    """Return a third-party specification; raise `ValueError` if it cannot be listed."""
+    """Return a third-party specification; raise ValueError if it is invalid."""
     if not isinstance(spec, TaskSpec):
         raise ValueError(f'{type(spec).__name__} given; allowed: a TaskSpec')
     if spec.name != name:

@@ -1,4 +1,4 @@
-"""Text of messages: one safe line, suggestions for misspelt names, shortened lists."""
+"""Text of error messages: one safe line, suggestions for misspelt names, shortened lists."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ _SHOWN = 40
 
 
 def did_you_mean(given: str, allowed: Iterable[str] | Mapping[str, str]) -> str:
-    """Return `; did you mean 'task'?` for a misspelt name, or ''.
+    """Return `; did you mean 'task'?` for a misspelt name, or '' if no allowed name is similar.
 
-    A mapping `allowed` leads from accepted names to the names to suggest.
+    If `allowed` is a mapping, the suggestion is the value of the most similar key.
     """
     meanings = allowed if isinstance(allowed, Mapping) else {name: name for name in allowed}
     by_lower = {name.lower(): meant for name, meant in meanings.items() if name}
@@ -23,7 +23,7 @@ def did_you_mean(given: str, allowed: Iterable[str] | Mapping[str, str]) -> str:
 
 
 def one_of(given: object, allowed: Sequence[Name], meaning: str) -> Name:
-    """Return `given`, an untrusted `meaning`, if it is allowed; raise ValueError otherwise."""
+    """Return `given` if it is allowed; raise ValueError, which begins with `meaning`, otherwise."""
     for name in allowed:
         if given == name:
             return name
@@ -33,7 +33,7 @@ def one_of(given: object, allowed: Sequence[Name], meaning: str) -> Name:
 
 
 def entries(owner: str, values: Any, allowed: Sequence[str]) -> dict[str, Any]:
-    """Return an untrusted mapping; raise ValueError for another type or an unknown name."""
+    """Return a mapping as a dictionary; raise ValueError for another type or an unknown key."""
     if not isinstance(values, Mapping):
         raise ValueError(
             f'{owner}: {one_line(values, _SHOWN)!r} given; allowed: a mapping of '
@@ -43,13 +43,13 @@ def entries(owner: str, values: Any, allowed: Sequence[str]) -> dict[str, Any]:
 
 
 def first_of(names: Sequence[str], most: int) -> str:
-    """Return the first of many names and the number of the others: `a, b and 3 more`."""
+    """Return at most `most` names as text, with the number of the others: `a, b and 3 more`."""
     rest = f' and {len(names) - most} more' if len(names) > most else ''
     return f'{", ".join(names[:most])}{rest}'
 
 
 def printable(text: str) -> str:
-    """Return text with the characters escaped that a terminal would interpret."""
+    """Return a text whose control characters, which a terminal would interpret, are escaped."""
     return ''.join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
 
 

@@ -1,4 +1,4 @@
-"""One tick of a robot and its messages."""
+"""The state of a robot at one tick, and the messages that report it."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ _READERS: dict[str, Callable[[str], Any]] = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EpisodeStatus:
-    """Contents of `episode_status`.
+    """Contents of the topic `episode_status`.
 
     Attributes:
         episode: Index of the episode since the node started, from 0.
@@ -65,8 +65,8 @@ class EpisodeStatus:
         control_hz: Ticks per second of simulated time; observations depend on it.
         episode_return: Sum of rewards so far.
         joint_prefix: Prefix of the joint names; left out of the message if it is the default.
-        disturbances: Disturbances, JSON; left out if there are none.
-        variation: Values drawn for the episode, JSON.
+        disturbances: Disturbances as JSON; left out of the message if there are none.
+        variation: Values that disturbances drew for the episode, as JSON; left out without any.
     """
 
     task: str
@@ -84,20 +84,23 @@ class EpisodeStatus:
     variation: str = ''
 
     def is_of_same_robot(self, other: EpisodeStatus) -> bool:
-        """Return whether the topics of both have the same layout."""
+        """Return whether task, rate and joint prefix are equal, so that topics have one layout."""
         return all(
             getattr(self, name) == getattr(other, name)
             for name in ('task', 'control_hz', 'joint_prefix')
         )
 
     def to_values(self) -> dict[str, str]:
-        """Return the key/value pairs of the message."""
+        """Return the key/value pairs of the message `episode_status`."""
         values = {key: str(value) for key, value in dataclasses.asdict(self).items()}
         return {key: text for key, text in values.items() if _LEFT_OUT.get(key) != text}
 
     @classmethod
     def from_values(cls, values: Mapping[str, str]) -> EpisodeStatus:
-        """Read the key/value pairs of a message, ignoring unknown keys, or raise ValueError."""
+        """Return the status in the key/value pairs of a message; raise ValueError if invalid.
+
+        Unknown keys are ignored.
+        """
         values = {**_LEFT_OUT, **values}
         missing = [f.name for f in dataclasses.fields(cls) if f.name not in values]
         if missing:
@@ -133,14 +136,14 @@ class Tick:
     Attributes:
         stamp_ns: Simulated time, nanoseconds.
         readings: Sensor readings, (topic.size,) for each topic.
-        desired_goal: (goal,).
-        achieved_goal: (goal,).
-        applied_command: (action,), command units, after clipping.
-        true_readings: Sensor readings without disturbances; None if there are none.
+        desired_goal: (goal size,).
+        achieved_goal: (goal size,).
+        applied_command: (action size,), command units, after clipping.
+        true_readings: Readings of undisturbed sensors; None if the robot has no disturbances.
         has_diverged: Whether the simulation diverged in the last step, which ends the episode;
             state, goal and reward are those after MuJoCo's reset.
-        late_commands: Steps of the episode so far whose command did not answer the observation
-            before; None in lockstep, where steps wait for commands.
+        late_commands: Number of steps of the episode whose command did not answer the latest
+            observation; None in lockstep, where steps wait for commands.
     """
 
     stamp_ns: int
@@ -157,7 +160,7 @@ class Tick:
 
 
 class TickEncoder:
-    """Turns ticks of one task into messages."""
+    """Encodes the ticks of one task as messages."""
 
     def __init__(self, task: TaskSpec) -> None:
         published = [spec for spec in topics(task) if spec.direction == 'published']
@@ -168,10 +171,10 @@ class TickEncoder:
     def encode(self, tick: Tick, latched: bool = False) -> list[tuple[TopicSpec, bytes]]:
         """Return the messages of a tick with their CDR bytes, in the order of `topics`.
 
-        `desired_goal` is latched and still part of every tick. So a policy that joins topics by
-        stamp never combines the state of an episode with the goal of the last one. `latched` adds
-        `episode_status`, at the reset and the end of an episode. A missing or wrong vector raises
-        ValueError.
+        `desired_goal` is part of every tick, although it is latched. A policy that joins topics by
+        stamp thus never combines a state with the goal of the previous episode. `latched` adds
+        `episode_status`; use it at the reset and the end of an episode. A missing vector, or one
+        of wrong size, raises ValueError.
         """
         messages = []
         # None leaves a topic out of this tick.
@@ -199,21 +202,21 @@ class TickEncoder:
         return messages
 
     def encode_clock(self, stamp_ns: int) -> tuple[TopicSpec, bytes]:
-        """Return `/clock` alone, for a simulation that stands still."""
+        """Return the topic and the message `/clock`, for a paused simulation."""
         clock = self._codecs[0]
         return clock.topic, clock.encode(stamp_ns, [])
 
     def encode_status(self, stamp_ns: int, status: EpisodeStatus) -> tuple[TopicSpec, bytes]:
-        """Return `episode_status` alone, for a simulation that has not started."""
+        """Return the topic and the message `episode_status`."""
         message = build_status(self._status, stamp_ns, 'episode', status.to_values())
         return self._status, serialize(self._status.type_name, message)
 
 
 def join_messages(messages: Sequence[tuple[TopicSpec, bytes]]) -> bytes:
-    """Return the CDR bytes of `latest_tick` for the messages of a tick.
+    """Join the messages of a tick to one message of `latest_tick`; return its CDR bytes.
 
-    `data` contains the CDR bytes of the messages in order. `layout` has a dimension for each: the
-    name of the topic as label, and the number of bytes as size and stride.
+    `data` contains the CDR bytes of the messages in order. `layout` has a dimension for each of
+    them: the label is the name of the topic, size and stride are the number of bytes.
     """
     dimension, layout = (
         message_class(f'std_msgs/msg/MultiArray{part}') for part in ('Dimension', 'Layout')
@@ -227,7 +230,7 @@ def join_messages(messages: Sequence[tuple[TopicSpec, bytes]]) -> bytes:
 
 
 def split_messages(data: bytes) -> dict[str, bytes]:
-    """Return the CDR bytes of each topic in a `latest_tick`, in order, or raise ValueError."""
+    """Split a `latest_tick` into the CDR bytes of each topic, in order, or raise ValueError."""
     message = deserialize(LATEST_TICK.type_name, data)
     rest, parts = bytes(message.data), {}
     for part in message.layout.dim:

@@ -1,4 +1,4 @@
-"""Topics and services as data: name, type, quality of service, units, frame, order."""
+"""Topics and services as data: names, types, quality of service, units, frames and order."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from msgs_spec.text import one_of
 
 @dataclass(frozen=True, slots=True)
 class QosSpec:
-    """Quality of service; late subscribers get the last `depth` `transient_local` messages."""
+    """Quality of service. If `transient_local`, late subscribers get the last `depth` messages."""
 
     depth: int
     reliability: Literal['reliable', 'best_effort']
@@ -60,12 +60,12 @@ class TopicSpec:
     """One topic.
 
     Attributes:
-        name: Relative to the node's namespace, except `/clock`.
+        name: Name relative to the namespace of the node; `/clock` is absolute.
         layout: Parts of the float64 vector of the message. Quaternions are wxyz in the vector and
             xyzw in the message.
-        frame: `header.frame_id`, or empty.
-        names: Joint names in the message.
-        direction: Seen from `sim_node`.
+        frame: `header.frame_id` of the message; empty if it has none.
+        names: Joint names in the message, for `joint_states`.
+        direction: Whether `sim_node` publishes the topic or subscribes to it.
         since: First `INTERFACE_VERSION` whose episode files contain the topic.
     """
 
@@ -86,7 +86,7 @@ class TopicSpec:
 
     @property
     def unit(self) -> str:
-        """Units of the parts, in order, each once."""
+        """The different units of the parts as text, in order."""
         return ', '.join(dict.fromkeys(part.unit for part in self.layout if part.unit))
 
 
@@ -116,7 +116,7 @@ def _joint_topic(task: TaskSpec) -> TopicSpec:
 
 
 def _body_topics(task: TaskSpec) -> list[TopicSpec]:
-    """Return the topics of the end effector or fingertips, then of the object."""
+    """Return the topics of the end effector (Fetch) or fingertips (hand), then of the object."""
     pose, twist = 'geometry_msgs/msg/PoseStamped', 'geometry_msgs/msg/TwistStamped'
     if task.robot.has_gripper_command:
         specs = [
@@ -242,7 +242,7 @@ GROUND_TRUTH = 'ground_truth'
 
 
 def ground_truth_topics(task: TaskSpec) -> tuple[TopicSpec, ...]:
-    """Return the additional topics of a disturbed robot: its true state."""
+    """Return the additional topics of a disturbed robot, which publish its true state."""
     return tuple(
         replace(
             spec,
@@ -254,7 +254,7 @@ def ground_truth_topics(task: TaskSpec) -> tuple[TopicSpec, ...]:
 
 
 def relative_name(resolved: str) -> str:
-    """Return the name of a topic within the namespace of its robot."""
+    """Return the name of a topic without the namespace of its robot: `/left/reward` -> `reward`."""
     namespace, _, name = resolved.rpartition('/')
     is_true_state = namespace.rpartition('/')[2] == GROUND_TRUTH
     return f'{GROUND_TRUTH}/{name}' if is_true_state else name
@@ -264,11 +264,13 @@ def relative_name(resolved: str) -> str:
 def topics(task: TaskSpec) -> tuple[TopicSpec, ...]:
     """Return all topics of a task.
 
-    The order is part of the contract. Published topics come first, in the order of a tick:
-    `applied_command` is the last topic of every tick, `episode_status` follows at some ticks.
-    Subscribed topics come next. A new topic of every tick stands before `applied_command`. It also
-    needs its value in `tick.TickEncoder.encode`, and a new `INTERFACE_VERSION`, which is its
-    `since`; then `make tables` writes the documentation.
+    The order is part of the contract. Published topics come first, in the order of publication:
+    `applied_command` is the last topic of every tick, and `episode_status` follows at some ticks.
+    Subscribed topics come next.
+
+    To add a topic of every tick, insert it before `applied_command`, add its value to
+    `tick.TickEncoder.encode`, and increase `INTERFACE_VERSION`, which is the `since` of the topic.
+    Then run `make tables` to update the documentation.
     """
     clock = TopicSpec(
         '/clock', 'rosgraph_msgs/msg/Clock', 'Simulated time, once per tick.', qos=CLOCK
@@ -283,7 +285,7 @@ def topics(task: TaskSpec) -> tuple[TopicSpec, ...]:
 
 
 def topic(task: TaskSpec, name: str) -> TopicSpec:
-    """Return the topic of a task by name, or raise ValueError, which lists all names."""
+    """Return a topic of a task by name; raise ValueError, which lists all names, if missing."""
     found = {spec.name: spec for spec in topics(task)}
     return found[one_of(name, list(found), f'{task.name} has no topic')]
 
@@ -321,14 +323,14 @@ SHOWN = (
 
 
 def _scalar(name: str, unit: str, text: str) -> TopicSpec:
-    """Return a topic of one number: the x of a vector, because ROS has no stamped number."""
+    """Return a topic with one number, in `x` of a vector: ROS has no number with a stamp."""
     layout = (VectorPart(name, 1, unit),)
     return TopicSpec(f'{_SCALARS}{name}', 'geometry_msgs/msg/Vector3Stamped', text, layout)
 
 
 @lru_cache(maxsize=_TASKS)
 def scalar_topics(task: TaskSpec) -> tuple[TopicSpec, ...]:
-    """Return the topics of the numbers of a tick that tools plot, stamped with the tick."""
+    """Return the topics with single numbers of a tick for plots, stamped as the tick."""
     found = []
     if task.position_counts:
         found.append(_scalar('distance', 'm', 'From the achieved to the desired position.'))
@@ -359,7 +361,7 @@ def view_topics(task: TaskSpec) -> tuple[TopicSpec, ...]:
 
 @dataclass(frozen=True, slots=True)
 class ServiceSpec:
-    """One service; `~/` in the name stands for the name of the node."""
+    """One service of a node; `~/` in its name stands for the name of the node."""
 
     name: str
     type_name: str

@@ -1,4 +1,4 @@
-"""Processes of this project: command lines, exit codes, signals, rclpy start and stop.
+"""Common parts of all processes: command lines, exit codes, signals, start and stop of rclpy.
 
-It depends on the contract (`msgs_spec`), but neither on the simulation nor on policies.
+This package depends on `msgs_spec`, but neither on the simulation nor on policies.
 """

@@ -66,7 +66,7 @@ class UsageError(CommandError):
 def usage_errors(
     errors: type[Exception] | tuple[type[Exception], ...] = ValueError, prefix: str = ''
 ) -> Iterator[None]:
-    """Turn these errors of the block into a `UsageError` with `prefix` before the message."""
+    """Raise `errors` of the block as `UsageError`, with `prefix` before the message."""
     try:
         yield
     except errors as error:
@@ -77,14 +77,14 @@ class CommandParser(argparse.ArgumentParser):
     """An argument parser with one-line errors and suggestions for misspelt names."""
 
     def error(self, message: str) -> NoReturn:
-        """Print the error with a suggestion and exit with 2."""
+        """Print the error with a suggestion and exit with code 2."""
         complain(self.prog, f'{message}{self._hint(message)}')
         sys.exit(EXIT_USAGE)
 
     def _print_message(self, message: str, file: Any = None) -> None:
         """Print help; exit with an error if the output cannot be written.
 
-        argparse would ignore that, or print a traceback.
+        argparse itself would ignore the failure or print a traceback.
         """
 
         def write() -> int:
@@ -127,7 +127,7 @@ def whole_number(lower: int, upper: int | None = None) -> Callable[[str], int]:
 
 
 def complain(name: str, text: object) -> None:
-    """Print one line on stderr, after the name of the command.
+    """Print a text as one line on stderr, after the name of the command.
 
     Line breaks become spaces and control characters are escaped.
     """
@@ -135,7 +135,7 @@ def complain(name: str, text: object) -> None:
 
 
 def complain_from_handler(name: str, text: object) -> None:
-    """Call `complain` from a signal handler, which may have interrupted another write."""
+    """Call `complain` in a signal handler; print nothing if the signal interrupted a write."""
     # Python forbids a write to a stream within another write to it.
     with suppress(RuntimeError):
         complain(name, text)
@@ -147,7 +147,7 @@ def say(text: object) -> None:
 
 
 def given_command(name: str, arguments: Sequence[str] | None) -> str:
-    """Return the command line as one line for the record; None means `sys.argv`."""
+    """Return a command line as one line, for metadata; `arguments` None means `sys.argv`."""
     words = [*name.split(), *(sys.argv[1:] if arguments is None else arguments)]
     return printable(shlex.join(words))
 
@@ -194,9 +194,9 @@ def _exit_code(name: str, run: Callable[[], int]) -> int:
 
 
 def _unclaimed_signals() -> list[signal.Signals]:
-    """Return the signals that a command handles: none within a program that has its own handlers.
+    """Return the signals that a command handles; none if the program handles SIGINT itself.
 
-    A shell starts background processes with SIGINT ignored; they still handle SIGTERM.
+    Shells start background processes with SIGINT ignored; these still handle the other signals.
     """
     ignores_interrupt = signal.getsignal(signal.SIGINT) == signal.SIG_IGN
     if not (has_default_interrupt() or ignores_interrupt):
@@ -207,7 +207,7 @@ def _unclaimed_signals() -> list[signal.Signals]:
 
 
 def make_output_usable() -> None:
-    """Replace a closed stdout or stderr and escape characters that their encoding lacks.
+    """Replace a missing stdout or stderr, and escape characters that their encoding lacks.
 
     Programs that handle SIGINT themselves keep their streams.
     """
@@ -223,7 +223,7 @@ def make_output_usable() -> None:
 
 
 def start_command(name: str, module: str, *extras: str) -> int:
-    """Import a module that needs extras and run its `main`, a command.
+    """Import `module`, which needs `extras` of this package, and return the result of its `main`.
 
     The import takes seconds; `guard_loading` handles Ctrl-C meanwhile.
     """
@@ -238,7 +238,10 @@ def start_command(name: str, module: str, *extras: str) -> int:
 
 
 def require_extra(extra: str, *needed: str) -> None:
-    """Raise UsageError, which names what to install, if packages of an extra are missing."""
+    """Raise UsageError, which names what to install, if modules of an extra are missing.
+
+    `needed` names the modules to check, if not all of the extra.
+    """
     missing = [module for module in needed or EXTRAS[extra] if find_spec(module) is None]
     if missing:
         source = 'source a ROS 2 Jazzy installation or ' if extra == 'ros' else ''
@@ -250,7 +253,7 @@ def require_extra(extra: str, *needed: str) -> None:
 
 
 def _require_rclpy() -> None:
-    """Reject an rclpy that was built for another Python."""
+    """Raise UsageError if rclpy cannot be imported, for example if it is for another Python."""
     try:
         import_module('rclpy')
     except (ImportError, OSError) as error:
@@ -263,7 +266,7 @@ def _require_rclpy() -> None:
 
 @contextmanager
 def progress(description: str, total: int) -> Iterator[Callable[[int], None]]:
-    """Show a progress bar with the remaining time where stderr is a terminal."""
+    """Show a progress bar if stderr is a terminal; yield a function that adds to its count."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
     from rich.progress import TimeRemainingColumn as Remaining

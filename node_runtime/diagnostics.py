@@ -1,7 +1,7 @@
 """Reports of the nodes on `/diagnostics`, and their statistics.
 
-They depend on wall time and are never logged with an episode, whose bytes depend on seed and
-commands only.
+Reports depend on wall-clock time. They are never logged with an episode, because the bytes of an
+episode file depend on seed and commands only.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ _LATEST = (2**31 - 1) * 10**9
 
 
 def next_report(due: float, now: float) -> float:
-    """Return when the next report is due, s of a steady clock; `due` is that of this one.
+    """Return the time at which the next report is due; `due` is the time of the present one.
 
-    The period stays regular. After a missed report, the next period is whole.
+    Times are seconds of a steady clock. After a missed report, a whole period follows `now`.
     """
     return due + REPORT_PERIOD if due + REPORT_PERIOD > now else now + REPORT_PERIOD
 
@@ -50,7 +50,7 @@ class Level(IntEnum):
 
 @dataclass(slots=True)
 class Report:
-    """One status: facts as key/value pairs, and problems."""
+    """One status of `/diagnostics`, with key/value pairs and problems."""
 
     name: str
     hardware_id: str
@@ -59,11 +59,11 @@ class Report:
     problems: list[tuple[Level, str]] = field(default_factory=list)
 
     def warn(self, problem: str) -> None:
-        """Add a problem that hinders but does not stop."""
+        """Add a problem of level WARN, with which the node continues to work."""
         self.problems.append((Level.WARN, problem))
 
     def fail(self, problem: str) -> None:
-        """Add a problem that makes results wrong or loses them."""
+        """Add a problem of level ERROR, which makes results wrong or loses them."""
         self.problems.append((Level.ERROR, problem))
 
     @property
@@ -73,7 +73,7 @@ class Report:
 
     @property
     def message(self) -> str:
-        """All problems, the worst first; without problems the summary."""
+        """All problems, the worst first; the summary if there are no problems."""
         ranked = sorted(self.problems, key=lambda problem: -problem[0])
         return '; '.join(text for _, text in ranked) or self.summary
 
@@ -81,8 +81,7 @@ class Report:
 def encode_reports(*reports: Report) -> bytes:
     """Return the CDR bytes of a DiagnosticArray with one or more statuses.
 
-    The stamp is wall time, as in REP 107, also under simulated time, so that the reports of several
-    nodes can be put in order.
+    The stamp is wall-clock time, as in REP 107, so that reports of several nodes can be sorted.
     """
     stamp_ns = min(time.time_ns(), _LATEST)
     message, *others = (
@@ -102,13 +101,13 @@ def encode_reports(*reports: Report) -> bytes:
 
 
 class Durations:
-    """The last thousand durations of a repeated event."""
+    """Statistics of the last 1000 durations of a repeated event."""
 
     def __init__(self) -> None:
         self._values: deque[float] = deque(maxlen=1000)
 
     def add(self, seconds: float) -> None:
-        """Add a duration."""
+        """Add a duration, s."""
         self._values.append(seconds)
 
     def median(self) -> float:
@@ -116,7 +115,7 @@ class Durations:
         return float(np.median(self._values)) if self._values else 0.0
 
     def milliseconds(self) -> dict[str, str]:
-        """Return median, 99th percentile and maximum as text; `-` before the first duration."""
+        """Return median, 99th percentile and maximum as text, ms; `-` without durations."""
         names = ('p50', 'p99', 'max')
         if not self._values:
             return dict.fromkeys(names, '-')
@@ -125,12 +124,12 @@ class Durations:
 
 
 class Increase:
-    """Growth of a counter between two calls; the counter starts at zero."""
+    """Computes the growth of a counter that starts at zero."""
 
     def __init__(self) -> None:
         self._before = 0.0
 
     def since(self, value: float) -> float:
-        """Return the growth since the last call."""
+        """Return by how much the counter, now `value`, has grown since the last call."""
         grown, self._before = value - self._before, value
         return grown

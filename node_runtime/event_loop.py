@@ -23,10 +23,11 @@ _CLOCK = getattr(time, 'CLOCK_BOOTTIME', time.CLOCK_MONOTONIC)
 
 
 class EventLoop:
-    """Run the callbacks of one node in the thread that owns the node.
+    """Runs the callbacks of one node in the thread that owns the node.
 
-    rclpy's EventsExecutor costs half of the wait-set executor per message; rclpy before 7.1.4 lacks
-    it. It is used through `spin_once` alone, because its `spin` serves nothing in some builds.
+    rclpy's EventsExecutor takes half the CPU time of the wait-set executor per message. rclpy
+    before 7.1.4 lacks it. Only its `spin_once` is used, because `spin` runs no callback in some
+    builds.
     """
 
     def __init__(self, node: Node) -> None:
@@ -37,7 +38,7 @@ class EventLoop:
         self._announce_until = self._announce_at = self._called_at
 
     def wait(self, seconds: float) -> None:
-        """Run one callback; return without one after `seconds`."""
+        """Wait up to `seconds` for a callback and run it."""
         self._executor.spin_once(timeout_sec=seconds)
         self._announce_after_suspension()
 
@@ -45,7 +46,7 @@ class EventLoop:
         """Run the callbacks that are waiting now, without those that arrive meanwhile.
 
         Args:
-            limit: Maximum number of callbacks. A number and not a time, so that the result does not
+            limit: Maximum number of callbacks. It is no time limit, so that the result does not
                 depend on the load of the machine.
         """
         self._announce_after_suspension()
@@ -67,10 +68,10 @@ class EventLoop:
         self._executor.remove_node(self._node)
 
     def _announce_after_suspension(self) -> None:
-        """Send the name of the node again after a suspension (SIGSTOP, a laptop that slept).
+        """Publish the name of the node again after a suspension (SIGSTOP, or sleep of the machine).
 
-        Other participants have removed this one and find it again without the names of its nodes.
-        rmw sends the names whenever a node gets or loses a publisher.
+        Other processes have then removed this one; they find it again, but not the names of its
+        nodes. rmw sends the names whenever a node creates or destroys a publisher.
         """
         now = time.clock_gettime(_CLOCK)
         if now - self._called_at > _SUSPENDED:
@@ -88,7 +89,7 @@ def _announce(node: Node) -> None:
 
 
 def _make_executor() -> tuple[Executor, bool]:
-    """Return an executor and whether it serves a queue in order."""
+    """Return an executor, and whether it runs callbacks in the order of their arrival."""
     try:
         from rclpy.experimental.events_executor import EventsExecutor
     except ImportError:

@@ -51,15 +51,15 @@ class NodeFailure(CommandError):
 
 
 class StopSignals:
-    """Record SIGINT, SIGTERM and SIGHUP, so that a node finishes its tick before it stops.
+    """Records SIGINT, SIGTERM and SIGHUP, so that a node finishes its tick before it stops.
 
     rclpy's own handlers would invalidate the context in the middle of a tick and lose the last
-    messages. In other threads than the main one nothing is recorded.
+    messages. An instance that is created outside of the main thread records nothing.
 
     Attributes:
         received: Name of the last signal, or None.
-        second_ends: Whether another signal, a second or more later, ends the process at once. For
-            nodes that run third-party code, which may never return.
+        second_ends: Whether another signal, more than a second later, ends the process at once.
+            Set it for nodes that run third-party code, which may never return.
     """
 
     def __init__(self) -> None:
@@ -83,9 +83,9 @@ class StopSignals:
         self._received_at = time.monotonic()
 
     def watch(self) -> Callable[[], bool]:
-        """Return a function that returns whether a signal came a second or more from now.
+        """Return a function that returns whether a signal arrived a second or more after this call.
 
-        Shells and supervisors may send several signals at once.
+        Earlier signals do not count, because shells and supervisors may send several at once.
         """
         earliest = time.monotonic() + _AT_ONCE
         return lambda: self._received_at >= earliest
@@ -101,8 +101,8 @@ def node_main(
 ) -> int:
     """Run a node of `NODES` as a process, or print its help; return the exit code of `run_node`.
 
-    `node_class` names a class, as `package.module:Class`. It has the methods `run(stop)` and
-    `destroy_node()`, and a ValueError in its constructor is wrong usage.
+    `node_class` names the class of the node as `package.module:Class`. The class has the methods
+    `run(stop)` and `destroy_node()`. A ValueError of its constructor is reported as wrong usage.
     """
     given = sys.argv[1:] if args is None else args
     if '-h' in given or '--help' in given:
@@ -126,7 +126,10 @@ def node_main(
 
 
 def destroy(node: Node, exit_code: int | None = None) -> None:
-    """Destroy a node whose work is done; end the process if that takes longer than 10 s."""
+    """Destroy a node; end the process with `exit_code` if that takes longer than 10 s.
+
+    Without `exit_code`, the code is that of the exception being handled, or 0 without one.
+    """
     error = sys.exception()
     if exit_code is None:
         exit_code = EXIT_SUCCESS if error is None else getattr(error, 'exit_code', EXIT_FAILURE)
@@ -136,12 +139,12 @@ def destroy(node: Node, exit_code: int | None = None) -> None:
 
 @contextmanager
 def ends_within(seconds: float, exit_code: int) -> Iterator[None]:
-    """End the process with `exit_code` if the body takes longer than `seconds`.
+    """End the process with `exit_code` if the block takes longer than `seconds`.
 
     Fast DDS 2.14 can spin for minutes while a participant is deleted (eProsima/Fast-DDS issue
     6513), and rclpy holds the interpreter meanwhile. No Python thread or signal handler runs then,
     but a timer of the C library does. `faulthandler.dump_traceback_later` would work too, but its
-    exit code is always 1. Stdout and stderr are flushed before the body. Works with glibc only.
+    exit code is always 1. Stdout and stderr are flushed before the block. Works with glibc only.
     """
     for stream in filter(None, (sys.stdout, sys.stderr)):
         with suppress(OSError, ValueError):
@@ -176,12 +179,12 @@ def run_node(
 
     Args:
         run: Runs until its work is done or a signal is recorded.
-        shared_memory: Whether to allow shared memory (see `ros`). For nodes that send
-            pictures and that no robot waits for.
+        shared_memory: Whether Fast DDS may use shared memory (see `ros`). Set it for nodes that
+            send pictures and for which no robot waits.
 
     Returns:
-        0 after the work is done or a signal; 2 for wrong usage; 1 for a failure. Both kinds of
-        error print one line on stderr.
+        0 after the work is done or a signal; 2 for wrong usage; 1 for a failure. Errors print one
+        line on stderr.
     """
     make_output_usable()
     # Before the imports below, which take seconds.
@@ -218,9 +221,9 @@ def run_node(
 
 
 def find_place_for_logs(environment: MutableMapping[str, str] = os.environ) -> None:
-    """Move ROS's logs to the temporary folder where the home directory is not writable.
+    """Set `ROS_LOG_DIR` to the temporary folder if the home directory is not writable.
 
-    ROS starts no node otherwise, for example in many containers.
+    Without a writable folder for logs, as in many containers, ROS starts no node.
     """
     if any(map(environment.get, ('ROS_LOG_DIR', 'ROS_HOME'))):
         return
@@ -249,7 +252,7 @@ def _initialise(init: Callable[..., None], args: list[str] | None, handlers: Any
 
 
 def _reject_arguments(args: Sequence[str]) -> None:
-    """Raise UsageError for arguments that rclpy would ignore or answer with `error not set`."""
+    """Raise UsageError for arguments that rclpy would ignore or reject without a reason."""
     inside = False
     for before, arg in pairwise(['', *args]):
         if arg == '--ros-args':

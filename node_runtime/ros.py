@@ -1,4 +1,4 @@
-"""Message classes, quality of service, the graph and the transport of rclpy."""
+"""Helpers for rclpy: message classes, quality of service, discovery and transport."""
 
 from __future__ import annotations
 
@@ -38,14 +38,14 @@ _PATIENCE = 6.0
 def seldom(seconds: float) -> dict[str, Any]:
     """Return arguments that make a logger print a line at most once in `seconds`.
 
-    rclpy throttles by the system clock, which would silence the line after the clock is set back.
+    By default rclpy uses the system clock; after it is set back, the line would not be printed.
     """
     return {'throttle_duration_sec': seconds, 'throttle_time_source_type': _steady_clock()}
 
 
 @cache
 def _steady_clock() -> Clock:
-    """Return one clock for all lines: a logger rejects another one for the same line."""
+    """Return the same clock at each call, because loggers reject a second clock for a line."""
     from rclpy.clock import Clock
     from rclpy.clock_type import ClockType
 
@@ -64,7 +64,7 @@ def ros_service_class(type_name: str) -> Any:
 
 
 def rclpy_profile(spec: QosSpec) -> QoSProfile:
-    """Return the profile for rclpy's `create_publisher` and `create_subscription`."""
+    """Return a quality of service as the profile that rclpy's publishers and subscriptions take."""
     from rclpy.qos import QoSDurabilityPolicy, QoSHistoryPolicy, QoSProfile, QoSReliabilityPolicy
 
     return QoSProfile(
@@ -76,7 +76,7 @@ def rclpy_profile(spec: QosSpec) -> QoSProfile:
 
 
 def open_publisher(node: Node, spec: TopicSpec) -> Publisher:
-    """Return a new publisher of a topic."""
+    """Create a publisher with the name, type and quality of service of a topic."""
     return node.create_publisher(
         ros_message_class(spec.type_name), spec.name, rclpy_profile(spec.qos)
     )
@@ -103,7 +103,7 @@ def subscribe(
 def full_name(namespace: str, name: str) -> str:
     """Return the full name of a node in a namespace, such as `/left/sim_node`.
 
-    Discovery finds a participant before the names of its nodes.
+    A node whose name discovery has not found yet gets a descriptive text instead.
     """
     if name == _UNKNOWN:
         return '(a node without a name yet)'
@@ -111,12 +111,12 @@ def full_name(namespace: str, name: str) -> str:
 
 
 def count_publishers(node: Node, topic: str) -> int:
-    """Return the number of publishers of a topic, after the node's remappings."""
+    """Return the number of publishers of a topic, whose name the node may remap."""
     return int(node.count_publishers(node.resolve_topic_name(topic)))
 
 
 def await_acknowledgements(publishers: Iterable[Publisher]) -> None:
-    """Wait up to a second until subscribers have the last messages."""
+    """Wait until reliable subscribers have acknowledged all messages, for a second at most."""
     from rclpy.duration import Duration
 
     deadline = time.monotonic() + _LAST_MESSAGES_SECONDS
@@ -126,7 +126,7 @@ def await_acknowledgements(publishers: Iterable[Publisher]) -> None:
 
 
 class SubscriberWatch:
-    """Track whether all subscribers of some publishers are connected and receive messages."""
+    """Tracks whether all subscribers of some publishers are connected."""
 
     def __init__(self, node: Node, publishers: Iterable[Publisher]) -> None:
         self._node = node
@@ -135,11 +135,11 @@ class SubscriberWatch:
         self._changed_at = 0.0
 
     def expect_more(self) -> None:
-        """Wait for subscriptions of a node that has just appeared."""
+        """Restart the wait for subscriptions, because a node has appeared."""
         self._changed_at = time.monotonic()
 
     def update(self) -> bool:
-        """Read the graph; return whether a topic has more subscribers than before."""
+        """Count the subscribers again; return whether a topic has more of them than before."""
         before = self._counts
         self._counts = [self._node.count_subscribers(each.topic_name) for each in self._publishers]
         if self._counts != before:
@@ -147,7 +147,10 @@ class SubscriberWatch:
         return any(have > had for have, had in zip(self._counts, before, strict=True))
 
     def are_connected(self) -> bool:
-        """Return whether all compatible subscribers are connected and the graph is quiet."""
+        """Return whether all subscribers are connected and no subscriber has just appeared.
+
+        After 6 s without changes, unconnected subscribers count as incompatible and are ignored.
+        """
         quiet_for = time.monotonic() - self._changed_at
         if quiet_for > _PATIENCE:
             return True

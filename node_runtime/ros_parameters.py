@@ -15,10 +15,10 @@ if TYPE_CHECKING:
 
 
 def declare_parameters(node: Node, specs: Sequence[ParameterSpec]) -> dict[str, Any]:
-    """Declare parameters with description and range and return their values.
+    """Declare parameters with description and range, and return their values by name.
 
-    Also offers the parameter services, so create the node with `start_parameter_services=False`.
-    Logs a warning for unknown parameters and for those under a former name.
+    This function also offers the parameter services; create the node with
+    `start_parameter_services=False`. Unknown parameters and former names are logged as warnings.
     """
     _serve_parameter_requests(node)
     # rclpy has no public access to given values before their declaration.
@@ -52,7 +52,7 @@ def _declare(node: Node, spec: ParameterSpec, given: Parameter | None) -> Any:
 
 
 def descriptor(spec: ParameterSpec) -> ParameterDescriptor:
-    """Return the ROS descriptor.
+    """Return the ROS descriptor of a parameter.
 
     Doubles are typed dynamically, because ROS reads `1` as an integer and would reject it.
     """
@@ -86,7 +86,7 @@ def set_callback(
 ) -> Callable[[list[Parameter]], SetParametersResult]:
     """Return a callback for `Node.add_on_set_parameters_callback` that checks new values.
 
-    Parameters of ROS itself pass.
+    Parameters of ROS itself are accepted, except `use_sim_time: true` if `makes_time`.
     """
     from rcl_interfaces.msg import SetParametersResult
 
@@ -109,7 +109,7 @@ def set_callback(
 def _serve_parameter_requests(node: Node) -> None:
     """Offer the parameter services, which reject parameters of an unknown type.
 
-    The services of rclpy raise an exception there, which ends the node.
+    The services of rclpy would raise an exception for these, which ends the node.
     """
     from rcl_interfaces.srv import SetParameters
     from rclpy.parameter_service import ParameterService
@@ -138,7 +138,7 @@ def _serve_parameter_requests(node: Node) -> None:
 
 
 def _rejection(message: Any) -> SetParametersResult | None:
-    """Return the answer to a parameter of an unknown type, or None."""
+    """Return the answer that rejects a parameter of an unknown type; None for known types."""
     from rcl_interfaces.msg import SetParametersResult
     from rclpy.parameter import Parameter
 

@@ -25,10 +25,10 @@ _SET_PARENT_DEATH_SIGNAL = 1
 
 
 def guard_loading() -> None:
-    """Make Ctrl-C end this process with one line while one of our commands is being imported.
+    """Make Ctrl-C end this process with one line while a command of this project is imported.
 
-    Imports take a second and more. `run_command` and `StopSignals` replace this handler as soon as
-    the command begins. Other programs that import our packages keep their handlers.
+    Imports take a second or more. `run_command` and `StopSignals` replace this handler as soon as
+    the command begins. Other programs that import these packages keep their handlers.
     """
     name = _command()
     if name and has_default_interrupt():
@@ -42,7 +42,7 @@ def has_default_interrupt() -> bool:
 
 
 def _command() -> str:
-    """Return the name of our command that runs in this process, or ''."""
+    """Return the name of the command of this project that this process runs; else ''."""
     program = sys.argv[0] if sys.argv else ''
     if program == '-m':
         # `python -m` sets the file name only after it has imported the packages of the module.
@@ -55,7 +55,7 @@ def _command() -> str:
 
 
 class _ExitAtOnce:
-    """A handler that exits at once, because an import may swallow KeyboardInterrupt."""
+    """A signal handler that ends the process at once; imports may swallow KeyboardInterrupt."""
 
     def __init__(self, name: str) -> None:
         self._name = name
@@ -73,15 +73,16 @@ def on_stop_signals(
     stop: Callable[[int, FrameType | None], None],
     raises_again: bool = False,
 ) -> Iterator[list[int]]:
-    """Call `stop` at the first of these signals; the next one has its default effect.
+    """Call `stop` when a signal arrives in the block; a second one has its default effect.
 
-    A closed terminal sends SIGHUP twice, so SIGHUP is ignored after the first.
+    A closed terminal sends SIGHUP twice, so a second SIGHUP is ignored. Yields the list of the
+    received signal numbers.
 
     Args:
         numbers: Signals to handle.
         stop: Called with the signal number and the frame.
         raises_again: Whether a second SIGINT raises KeyboardInterrupt instead of ending the
-            process, for programs of users such as notebooks.
+            process. Set it in programs of users, such as notebooks.
     """
     received: list[int] = []
 
@@ -116,9 +117,9 @@ def available_signals(numbers: Iterable[signal.Signals]) -> list[signal.Signals]
 
 
 def discard_unread_output() -> None:
-    """Redirect stdout and stderr to /dev/null where their terminal or pipe is closed.
+    """Redirect stdout and stderr to /dev/null if their terminal or pipe is closed.
 
-    For commands that continue after their reader has ended.
+    Commands use it to continue after the process that reads their output has ended.
     """
     for number in (1, 2):
         if is_unread(number):
@@ -133,16 +134,16 @@ def is_unread(number: int) -> bool:
 
 
 def discard_output(number: int) -> None:
-    """Redirect a file descriptor to /dev/null, so that the last flush raises no error."""
+    """Redirect a file descriptor to /dev/null, so that the flush at exit raises no error."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, number)
     os.close(nowhere)
 
 
 def end_with_parent(parent: int) -> None:
-    """Make Linux send SIGTERM to this process when its parent ends.
+    """Make Linux send SIGTERM to this process when its parent, the process `parent`, ends.
 
-    For processes outside of their parent's group, which Ctrl-C does not reach.
+    Processes outside of the process group of the parent need it; Ctrl-C does not reach them.
     """
     if sys.platform != 'linux':
         return

@@ -1,4 +1,4 @@
-"""The source revision that episodes and actors record."""
+"""The source revision, which episode files and actors record."""
 
 from __future__ import annotations
 
