@@ -88,7 +88,7 @@ def decode_status(message: Any) -> dict[str, str]:
 
 
 def answer_label(stamp: int) -> str:
-    """Return the label in a command's layout that names the stamp of the observation it answers."""
+    """Return the layout label of a command that answers the observation with this stamp."""
     return f'answers {stamp:019d}'
 
 

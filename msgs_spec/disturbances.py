@@ -43,7 +43,7 @@ class Kind:
     is_factor: bool = False
 
     def checked(self, name: str, value: Any) -> Any:
-        """Return a value as number or pair of this kind; raise ValueError if it is not allowed."""
+        """Return a value as a number or, for ranges, a pair; raise ValueError if not allowed."""
         given = list(value) if self.is_range and isinstance(value, (list, tuple)) else [value]
         is_right = len(given) in (1, 1 + self.is_range) and all(
             isinstance(each, (int, float))

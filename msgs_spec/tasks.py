@@ -58,7 +58,7 @@ class GoalKind(Enum):
 
 @dataclass(frozen=True, slots=True)
 class VectorPart:
-    """A named run of `size` numbers in the vector of an observation, a topic or a command."""
+    """A name for `size` consecutive numbers of an observation, a topic or a command."""
 
     name: str
     size: int

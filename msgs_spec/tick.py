@@ -66,7 +66,7 @@ class EpisodeStatus:
         episode_return: Sum of rewards so far.
         joint_prefix: Prefix of the joint names; left out of the message if it is the default.
         disturbances: Disturbances as JSON; left out of the message if there are none.
-        variation: Values that disturbances drew for the episode, as JSON; left out without any.
+        variation: Values that disturbances drew for the episode, as JSON; left out if empty.
     """
 
     task: str

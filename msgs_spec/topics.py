@@ -64,7 +64,7 @@ class TopicSpec:
         layout: Parts of the float64 vector of the message. Quaternions are wxyz in the vector and
             xyzw in the message.
         frame: `header.frame_id` of the message; empty if it has none.
-        names: Joint names in the message, for `joint_states`.
+        names: Joint names in the message; empty for types without joints.
         direction: Whether `sim_node` publishes the topic or subscribes to it.
         since: First `INTERFACE_VERSION` whose episode files contain the topic.
     """

@@ -240,7 +240,7 @@ def start_command(name: str, module: str, *extras: str) -> int:
 def require_extra(extra: str, *needed: str) -> None:
     """Raise UsageError, which names what to install, if modules of an extra are missing.
 
-    `needed` names the modules to check, if not all of the extra.
+    `needed` names the modules to check; by default all modules of the extra are checked.
     """
     missing = [module for module in needed or EXTRAS[extra] if find_spec(module) is None]
     if missing:

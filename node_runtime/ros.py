@@ -38,7 +38,7 @@ _PATIENCE = 6.0
 def seldom(seconds: float) -> dict[str, Any]:
     """Return arguments that make a logger print a line at most once in `seconds`.
 
-    By default rclpy uses the system clock; after it is set back, the line would not be printed.
+    The default, the system clock, would suppress the line for long after the clock is set back.
     """
     return {'throttle_duration_sec': seconds, 'throttle_time_source_type': _steady_clock()}
 

@@ -147,7 +147,7 @@ class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32
 
     @property
     def dt(self) -> float:
-        """Simulated seconds per step; follows `model.opt.timestep`."""
+        """Simulated seconds per step, which depend on `model.opt.timestep`."""
         self._physics.send()
         return super().dt
 

@@ -1,8 +1,8 @@
-"""Environments with the interface of Gymnasium-Robotics 1.4.2 ("the reference" in this module).
+"""Environments with the interface of Gymnasium-Robotics 1.4.2.
 
 Names, types and defaults are those of its `robot_env.py`, `fetch_env.py`, `reach.py` and
-`manipulate.py`. Subclasses may override the methods of the reference for goals, observations and
-the end of episodes. `docs/gymnasium_robotics.md` lists the differences.
+`manipulate.py`. Subclasses may override its methods for goals, observations and the end of
+episodes. `docs/gymnasium_robotics.md` lists the differences.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def _is_ours(spec: gymnasium.envs.registration.EnvSpec) -> bool:
 
 @functools.cache
 def import_goal_env() -> Any:
-    """Return the reference's class `GoalEnv`, or `gymnasium.Env` if it is not installed.
+    """Return `GoalEnv` of Gymnasium-Robotics, or `gymnasium.Env` if that is not installed.
 
     Importing Gymnasium-Robotics registers its environments and prints a note. This function keeps
     the ids of this package and suppresses the note.
@@ -89,7 +89,7 @@ CAMERAS: dict[str, dict[str, Any]] = {
 
 
 def _pictures(task: str, camera: Mapping[str, Any] | None) -> dict[str, Any]:
-    """Return the reference's arguments for pictures; `camera` replaces some camera attributes."""
+    """Return size and camera of Gymnasium-Robotics' pictures, with the attributes `camera`."""
     view = {**CAMERAS[task_spec(task).robot.name], **(camera or {})}
     return {'width': SIZE, 'height': SIZE, 'default_camera_config': view}
 
@@ -111,7 +111,7 @@ class RobotEnv(FetchHandEnv, GoalEnv):
     """
 
     metadata = {'render_modes': RENDER_MODES, 'render_fps': 25}  # noqa: RUF012
-    # Hooks of the reference.
+    # Hooks of Gymnasium-Robotics.
     _uncalled = (
         *('_env_setup', '_initialize_simulation', '_mujoco_step'),
         *('_reset_sim', '_set_action', '_step_callback'),
@@ -172,13 +172,13 @@ class RobotEnv(FetchHandEnv, GoalEnv):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Start an episode; `options` is ignored, as in the reference."""
+        """Start an episode; `options` is ignored, as in Gymnasium-Robotics."""
         started = super().reset(seed=seed)
         self._show_goal()
         return started
 
     def step(self, action: Any) -> tuple[Observation, Any, bool, bool, dict[str, Any]]:
-        """Advance one tick; sparse rewards and `is_success` are float32, as in the reference."""
+        """Advance one step; sparse rewards and `is_success` are float32 as in `robot_env.py`."""
         observation, reward, terminated, truncated, info = super().step(action)
         self._show_goal()
         if not self.overrides('_is_success'):
@@ -426,7 +426,7 @@ class ManipulateEnv(RobotEnv):
 
 
 def make_env(task: str, **arguments: Any) -> RobotEnv:
-    """Make the environment of a task with the interface of the reference."""
+    """Make the environment of a task with the interface of Gymnasium-Robotics."""
     spec = task_spec(task)
     if task in FETCH_CONFIGS:
         return FetchEnv(task, **arguments)
@@ -445,13 +445,13 @@ def _sites(model: mujoco.MjModel, prefix: str) -> list[int]:
 
 
 def _goal_kind(task: str) -> tuple[str, str]:
-    """Return the reference's `target_position` and `target_rotation` for a task."""
+    """Return `target_position` and `target_rotation` of a task, as in Gymnasium-Robotics."""
     position = 'random' if task_spec(task).position_counts else 'ignore'
     return position, MANIPULATE_CONFIGS[task].target_rotation
 
 
 def task_with_goals(task: str, position: str | None, rotation: str | None) -> str:
-    """Return the name of the task with the same object and these goals; None keeps a setting."""
+    """Return the task with the object of `task` and these goals; None means as in `task`."""
     one_of(task, list(MANIPULATE_CONFIGS), 'task')
     own, asset = _goal_kind(task), MANIPULATE_CONFIGS[task].asset
     wanted = (position or own[0], rotation or own[1])
@@ -469,7 +469,7 @@ def task_with_goals(task: str, position: str | None, rotation: str | None) -> st
 
 
 class GymnasiumRoboticsVectorEnv(FetchHandVectorEnv):
-    """N copies of a task with the results of `SyncVectorEnv` and Gymnasium-Robotics."""
+    """N copies of a task; results equal those of Gymnasium-Robotics in a `SyncVectorEnv`."""
 
     def __init__(
         self,
@@ -493,7 +493,7 @@ class GymnasiumRoboticsVectorEnv(FetchHandVectorEnv):
         seed: int | Sequence[int | None] | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[Observation, dict[str, Any]]:
-        """Start episodes; `options` other than `reset_mask` are ignored, as in the reference."""
+        """Start episodes; options other than `reset_mask` are ignored, as in Gymnasium-Robotics."""
         known = None
         if isinstance(options, dict) and 'reset_mask' in options:
             known = {'reset_mask': options['reset_mask']}
@@ -502,7 +502,7 @@ class GymnasiumRoboticsVectorEnv(FetchHandVectorEnv):
     def step(
         self, actions: NDArray[np.float32]
     ) -> tuple[Observation, Array, Flags, Flags, dict[str, Any]]:
-        """Step as `FetchHandVectorEnv` does; `is_success` is float32, as in the reference."""
+        """Step as `FetchHandVectorEnv` does; `is_success` is float32, as in Gymnasium-Robotics."""
         observation, reward, terminated, truncated, info = super().step(actions)
         for each in (info, info.get('final_info', {})):
             if 'is_success' in each:

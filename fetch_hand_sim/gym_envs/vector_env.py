@@ -30,10 +30,11 @@ _RENDER_MODES = [mode for mode in RENDER_MODES if mode != 'human']
 class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float32], Any]):
     """N copies of one task, stepped together on all processors.
 
-    It equals a `SyncVectorEnv` of N single environments bit for bit, in each autoreset mode of
-    Gymnasium. `NEXT_STEP`: the step after the end starts the next episode, ignores the action and
-    has reward 0. `SAME_STEP`: the step that ends an episode starts the next one, and
-    `info['final_obs']` is its last observation. `DISABLED`: only `reset_mask` starts episodes.
+    Results equal those of a `SyncVectorEnv` of N single environments bit for bit, in each autoreset
+    mode of Gymnasium. `NEXT_STEP`: the step after an episode ends starts the next one, ignores the
+    action and has reward 0. `SAME_STEP`: the step that ends an episode starts the next one, and
+    `info['final_obs']` is the last observation of the ended episode. `DISABLED`: only `reset` with
+    `reset_mask` starts episodes.
     `pickle` and `copy.deepcopy` keep the state.
 
     Subclasses may override `compute_reward`, `compute_terminated` and `compute_truncated`. These
@@ -237,7 +238,7 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
 
     @property  # type: ignore[misc]
     def np_random(self) -> tuple[np.random.Generator, ...]:  # type: ignore[override]
-        """The random generators of the N environments, live."""
+        """The random generators, no copies, of the N environments."""
         for index, seed in enumerate(self._seeds):
             if seed is None:
                 # A generator that is read before the first episode also draws that episode.

@@ -241,7 +241,7 @@ class Disturber:
         return np.asarray(self._uniform[self._all, self._tick % _BLOCK, number])
 
     def _error(self, name: str, noise: float | Array) -> Array:
-        """Return the error of a signal at this tick, (N, columns): its bias plus white noise."""
+        """Return the error of signal `name` at this tick, (N, columns): bias plus white noise."""
         columns = self._columns[name]
         white = self._normal[self._all, self._tick % _BLOCK, columns]
         return np.asarray(noise * white + self._biases[:, columns])

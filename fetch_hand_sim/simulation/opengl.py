@@ -1,4 +1,4 @@
-"""Choose the OpenGL backend: `MUJOCO_GL`, a display (GLFW), EGL, or OSMesa.
+"""Choose the OpenGL backend: `MUJOCO_GL` if set, else the first usable of GLFW, EGL, OSMesa.
 
 MuJoCo itself reads `MUJOCO_GL` when it is imported and defaults to GLFW. This module chooses at the
 first picture, so the order of imports does not matter.
@@ -81,7 +81,7 @@ def _process_that_draws() -> int:
 
 @functools.cache
 def _backend() -> str:
-    """Choose the backend for this process: `MUJOCO_GL`, then a display, then EGL, then OSMesa.
+    """Choose the backend: `MUJOCO_GL` if set, else the first usable of GLFW, EGL, OSMesa.
 
     GLFW is not tried without a display, because a second attempt would end the process.
     """

@@ -67,7 +67,7 @@ _MANIPULATE_VIEW = View((1.05, 0.89, 0.18), 0.47, 62.0, -38.0)
 
 
 def default_view(spec: TaskSpec) -> View:
-    """Return the usual camera of a task."""
+    """Return the default camera view of a task."""
     if spec.robot.has_gripper_command:
         return _SLIDE_VIEW if spec.looks_like == 'FetchSlide' else _FETCH_VIEW
     return _REACH_VIEW if spec.goal is GoalKind.FINGERTIPS else _MANIPULATE_VIEW
@@ -244,7 +244,7 @@ def tracked_position(frame: Frame) -> Array:
 
 
 def trail_of(frames: Sequence[Frame], index: int) -> list[Array]:
-    """Return tracked positions (3,) of frame `index` and of `TRAIL_TICKS` frames before it."""
+    """Return tracked positions (3,) of frame `index` and up to `TRAIL_TICKS` frames before."""
     return [tracked_position(frame) for frame in frames[max(0, index - TRAIL_TICKS) : index + 1]]
 
 

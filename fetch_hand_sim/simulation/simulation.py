@@ -96,7 +96,7 @@ class Simulation:
             that MuJoCo derives from the state.
         timing: What stays the same at rates other than 25 Hz. `seconds`: the duration of an episode
             and the speed of the Fetch gripper. `ticks`: the steps of an episode and the gripper's
-            distance per step, as in the reference.
+            distance per step, as in Gymnasium-Robotics.
         disturbances: Delays, noise and changed physics, in any form that
             `msgs_spec.disturbances.read_disturbances` accepts. `observation` then contains the
             measurements of disturbed sensors; `achieved_goal`, rewards and success follow the true
@@ -218,7 +218,7 @@ class Simulation:
         self._task.follow_model()
 
     def generator(self, index: int) -> np.random.Generator:
-        """Return the random generator, no copy, for starts and goals of simulation `index`."""
+        """Return the random generator, no copy, that draws starts and goals of a simulation."""
         generator = self._generators[self._index(index)]
         if generator is None:
             generator = self._generators[index] = seeding.np_random(None)[0]

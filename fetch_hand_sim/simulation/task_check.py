@@ -25,7 +25,7 @@ Rules = Iterator[tuple[Any, str]]
 
 
 def check_task(name: str) -> None:
-    """Check that the class of a task, one of `TASKS`, follows its specification.
+    """Check that the simulation class of the task `name` follows its specification.
 
     Run it once in the tests of the third-party package. The simulation itself checks none of this.
 

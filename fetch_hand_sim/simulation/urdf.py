@@ -95,7 +95,7 @@ class RobotDescription:
         self.joints = [joint for body in self._bodies for joint in self._joints_of(body)]
 
     def poses(self, positions: Mapping[str, float]) -> dict[str, Pose]:
-        """Return the pose of each link in the root for joint positions, rad or m; 0 if missing."""
+        """Return the pose of each link relative to the root; missing joint positions are 0."""
         found = {ROOT: Pose(np.zeros(3), IDENTITY)}
         for joint in self.joints:
             found[joint.child] = found[joint.parent] @ joint.pose(positions.get(joint.name, 0.0))

@@ -1,7 +1,7 @@
 """The four Fetch tasks: a mocap-driven gripper, with or without an object.
 
-Trajectories equal those of `fetch_env.py` of Gymnasium-Robotics 1.4.2 bit for bit. As there, poses
-of bodies and sites lag the state by one substep, except in tasks with a blocked gripper, where a
+Trajectories equal those of `fetch_env.py` of Gymnasium-Robotics 1.4.2 bit for bit. Poses of bodies
+and sites therefore lag the state by one substep, except in tasks with a blocked gripper, where a
 forward pass updates them. Velocities combine the Jacobian of these poses with the newest qvel. Each
 action moves the mocap body relative to the lagged gripper pose.
 """
@@ -239,7 +239,7 @@ class FetchTask(Task):
     def apply_commands(self, commands: NDArray[np.floating]) -> None:
         """Set the mocap target, 0.05 m per unit of command at 25 Hz, and the finger actuators.
 
-        The offset is scaled in the floating type of the command, as in the reference.
+        The offset is scaled in the floating type of the command, as in Gymnasium-Robotics.
         """
         offset = commands[:, :3] * commands.dtype.type(GRIPPER_STEP * self.lead_scale)
         if self.model.nu:
@@ -257,7 +257,7 @@ class FetchTask(Task):
         return np.zeros((self.batch.nsim, self.spec.robot.action_size))
 
     def _finger_controls(self, fingers: NDArray[np.floating] | float) -> Array:
-        """Return actuator targets; those of position actuators are relative to the fingers."""
+        """Return actuator targets: for position actuators, command plus present finger position."""
         model = self.model
         controls = np.broadcast_to(fingers, self._ctrl.shape).astype(np.float64)
         relative = np.flatnonzero(model.actuator_biastype != mujoco.mjtBias.mjBIAS_NONE)

@@ -176,7 +176,7 @@ class HandManipulateTask(HandTask):
         return np.concatenate([position, quaternion / np.linalg.norm(quaternion)])
 
     def _object_twist(self) -> Array:
-        """Return the object's velocity (N, 6) in world axes; in qvel, rotation has object axes."""
+        """Return the linear and angular velocity of the object in world axes, (N, 6)."""
         rotation = quaternion_to_matrix(self._object_qpos[:, 3:])
         angular = np.einsum('nij,nj->ni', rotation, self._object_qvel[:, 3:])
         return np.concatenate([self._object_qvel[:, :3], angular], axis=1)
@@ -187,7 +187,10 @@ class HandManipulateTask(HandTask):
 
 
 def _parallel_rotations() -> Array:
-    """Return the 24 rotations that map a cube to itself, Euler xyz (24, 3), in reference order."""
+    """Return the 24 rotations that map a cube to itself, as Euler angles xyz (24, 3), rad.
+
+    The order is that of Gymnasium-Robotics.
+    """
     quarter = np.pi / 2
     products = list(itertools.product([0.0, quarter, -quarter, np.pi], repeat=3))
     turns = np.round(quaternion_to_euler(euler_to_quaternion(products)) / quarter)

@@ -67,8 +67,8 @@ def _log_warning(message: str) -> None:
 def _stop_timers() -> None:
     """Remove the clock that the Python bindings install to fill `MjData.timer`.
 
-    MuJoCo reads it some twenty times per substep, 4-7 % of a step of these small models, and the
-    bindings offer no way to switch it off. Trajectories do not depend on it.
+    MuJoCo reads this clock about twenty times per substep, 4-7 % of the step time of these models.
+    The bindings offer no way to switch it off. Trajectories do not depend on it.
     """
     for library in Path(mujoco.__file__).parent.glob('libmujoco*'):
         try:
@@ -100,7 +100,7 @@ Generators = Sequence[np.random.Generator]
 
 @dataclass(frozen=True, slots=True)
 class BatchConfig:
-    """Size and settings of a batch of simulations; fields as the arguments of `Simulation`."""
+    """Size and settings of a batch of simulations; `Simulation` explains the fields."""
 
     num_envs: int = 1
     num_threads: int = 0
