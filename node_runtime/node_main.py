@@ -128,7 +128,7 @@ def node_main(
 def destroy(node: Node, exit_code: int | None = None) -> None:
     """Destroy a node; end the process with `exit_code` if that takes longer than 10 s.
 
-    Without `exit_code`, the code is that of the exception being handled, or 0 without one.
+    Without `exit_code`, the code follows from the exception being handled; 0 if there is none.
     """
     error = sys.exception()
     if exit_code is None:
@@ -221,7 +221,7 @@ def run_node(
 
 
 def find_place_for_logs(environment: MutableMapping[str, str] = os.environ) -> None:
-    """Set `ROS_LOG_DIR` to the temporary folder if the home directory is not writable.
+    """Set an unset `ROS_LOG_DIR` to the temporary folder if the home directory is not writable.
 
     Without a writable folder for logs, as in many containers, ROS starts no node.
     """

@@ -147,7 +147,7 @@ class SubscriberWatch:
         return any(have > had for have, had in zip(self._counts, before, strict=True))
 
     def are_connected(self) -> bool:
-        """Return whether all subscribers are connected and no subscriber has just appeared.
+        """Return whether all subscribers are connected and their number has not just changed.
 
         After 6 s without changes, unconnected subscribers count as incompatible and are ignored.
         """

@@ -73,7 +73,7 @@ def on_stop_signals(
     stop: Callable[[int, FrameType | None], None],
     raises_again: bool = False,
 ) -> Iterator[list[int]]:
-    """Call `stop` when a signal arrives in the block; a second one has its default effect.
+    """Call `stop` when a signal arrives in the block; its repetition has the default effect.
 
     A closed terminal sends SIGHUP twice, so a second SIGHUP is ignored. Yields the list of the
     received signal numbers.

@@ -34,8 +34,7 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
     mode of Gymnasium. `NEXT_STEP`: the step after an episode ends starts the next one, ignores the
     action and has reward 0. `SAME_STEP`: the step that ends an episode starts the next one, and
     `info['final_obs']` is the last observation of the ended episode. `DISABLED`: only `reset` with
-    `reset_mask` starts episodes.
-    `pickle` and `copy.deepcopy` keep the state.
+    `reset_mask` starts episodes. `pickle` and `copy.deepcopy` keep the state.
 
     Subclasses may override `compute_reward`, `compute_terminated` and `compute_truncated`. These
     methods take (achieved_goal, desired_goal, info) of all N environments, goals (N, goal size),
