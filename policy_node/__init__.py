@@ -1,6 +1,6 @@
 """Actors trained with hindsight experience replay, and the ROS node that runs them.
 
-Importing this package is light: torch is loaded with the first actor.
+Importing this package is fast, because torch is loaded only with the first actor.
 """
 
 from __future__ import annotations

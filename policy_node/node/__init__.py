@@ -1,8 +1,8 @@
 """`policy_node`: join the topics of a robot by stamp, run a policy, publish its commands.
 
 It uses topics only, so it also works on another machine or with a replayed episode. `responder.py`
-handles messages without ROS; `node.py` is the node. Slow imports wait until the handler of Ctrl-C
-is set.
+handles messages without ROS; `node.py` is the node. Slow imports run only after the handler of
+Ctrl-C is set.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""`python -m policy_node.node`."""
+"""Entry point of `python -m policy_node.node`."""
 
 import sys
 

@@ -29,7 +29,7 @@ class Pace:
 
     Attributes:
         is_paused: Whether the robot is paused.
-        period: Wall-clock time for a command, seconds; infinite in lockstep, 0 at full speed.
+        period: Wall-clock seconds from one step to the next; infinite in lockstep, 0 at full speed.
     """
 
     is_paused: bool
@@ -37,7 +37,7 @@ class Pace:
 
 
 def read_pace(message: Any, namespace: str) -> Pace | None:
-    """Return the pace of the robot in a namespace from a message on `/diagnostics`, or None."""
+    """Return the pace of the robot in a namespace; None if a `/diagnostics` message has none."""
     for status in message.status:
         if status.name.rpartition('/')[0] == namespace.rstrip('/'):
             values = {pair.key: pair.value for pair in status.values}
@@ -56,7 +56,7 @@ def _period(values: Mapping[str, str]) -> float:
 
 
 class Health:
-    """Makes the diagnostics of the node, `name`, from the counters of its responder."""
+    """Makes the diagnostic reports of the node `name` from the counters of its `Responder`."""
 
     def __init__(self, name: str) -> None:
         self._name = name
@@ -75,7 +75,7 @@ class Health:
         self._increases.clear()
 
     def stop(self) -> None:
-        """Wait for a robot again."""
+        """Stop reporting on the robot; the next reports say that the node waits for a robot."""
         self._responder = None
 
     def report(
@@ -87,7 +87,7 @@ class Health:
         missing: Sequence[str] = (),
         publishers: Mapping[str, int] = MappingProxyType({}),
     ) -> Report:
-        """Report on the period since the last report.
+        """Return the report on the period since the last report.
 
         Args:
             now: Seconds of the responder's clock.
@@ -125,15 +125,15 @@ class Health:
         return report
 
     def _grown(self, responder: Responder) -> dict[str, int]:
-        """Return the growth of the counters since the last report."""
+        """Return how much each counter has grown since the last report, by name."""
         counters = {name: getattr(responder, name) for name in _COUNTERS}
         counters['dropped'] = responder.join.dropped
         return {name: round(self._increases[name].since(n)) for name, n in counters.items()}
 
     def news(self, report: Report) -> list[str]:
-        """Return the problems of `report` that the report before did not have.
+        """Return the problems of `report` that the previous report did not have.
 
-        Problems that differ only in their numbers are the same.
+        Problems with equal text before the first colon count as the same.
         """
         kinds = {text.partition(':')[0]: text for _, text in report.problems}
         fresh = [text for kind, text in kinds.items() if kind not in self._said]

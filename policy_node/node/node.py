@@ -45,7 +45,7 @@ _ANY_TASK = next(iter(TASKS.values()))
 class PolicyNode(Node):
     """Wait for a robot, check that the policy fits it, then answer every tick with a command.
 
-    A robot that returns with another task or frequency is a new robot.
+    A robot that restarts with another task or frequency counts as a new robot.
 
     Raises:
         UsageError: If a parameter is invalid or the policy cannot be loaded.
@@ -122,7 +122,7 @@ class PolicyNode(Node):
             raise UsageError(str(error)) from None
 
     def _start(self, status: EpisodeStatus, loop: EventLoop, stop: StopSignals) -> None:
-        """Begin to answer the robot that was found."""
+        """Subscribe to the state of the robot, wait for its publishers and open `commands`."""
         try:
             policy = self._loaded = self._load_for(status)
             responder = Responder(policy, status, self._send)
@@ -149,7 +149,7 @@ class PolicyNode(Node):
         self.get_logger().info(f'{policy.task}: commands come from {policy.description}')
 
     def _load_for(self, status: EpisodeStatus) -> LoadedPolicy:
-        """Return the policy for a robot.
+        """Return the loaded policy if it has the task of the robot, else load one for this task.
 
         Raises:
             ValueError: If no policy is found, or it does not fit the robot.
@@ -166,7 +166,7 @@ class PolicyNode(Node):
         return before is not None and now is not None and not now.is_of_same_robot(before)
 
     def _take_policy(self, parameters: list[Parameter]) -> SetParametersResult:
-        """Load another policy at once, so that the parameter request reports errors."""
+        """Load a new `policy` while the parameter is set, so that the request reports errors."""
         result = set_callback(POLICY_NODE)(parameters)
         for parameter in parameters:
             if parameter.name != 'policy' or not result.successful:
@@ -181,7 +181,9 @@ class PolicyNode(Node):
         return result
 
     def _load_for_one(self, name: str) -> tuple[LoadedPolicy | None, EpisodeStatus | None]:
-        """Load a policy; return it and the robot that it fits, None for each that is not yet known.
+        """Load a policy; return it and the last status of the robot that it fits.
+
+        None replaces the policy if its task is not known yet, and the status if no robot is known.
 
         Raises:
             ValueError: If the policy cannot be loaded, or fits no robot.
@@ -206,7 +208,7 @@ class PolicyNode(Node):
         raise problems[0]
 
     def _leave(self) -> None:
-        """Release the robot, before another policy or another robot."""
+        """Close the topics of the robot, before the node changes its policy or robot."""
         before, now = self._answered_status, self._status
         if not self._is_replaced:
             assert before is not None and now is not None
@@ -225,7 +227,7 @@ class PolicyNode(Node):
         self._health.stop()
 
     def _announce(self, policy: LoadedPolicy) -> None:
-        """Publish the name of the policy for the robot's log, with the robot's last stamp."""
+        """Publish name and hash of the policy for the robot's log, with the robot's last stamp."""
         status = topic(task_spec(policy.task), 'policy_status')
         values = {'commander': policy.description, 'checkpoint_sha256': policy.sha256}
         message = build_status(status, self._status_stamp, NODE_NAME, values)
@@ -234,7 +236,7 @@ class PolicyNode(Node):
         publisher.publish(serialize(status.type_name, message))
 
     def _reader(self, spec: TopicSpec, callback: Callable[[Any], None]) -> Callable[[bytes], None]:
-        """Return a callback for raw messages: `callback` gets readable ones, others are logged."""
+        """Return a callback that decodes raw messages for `callback` and warns of invalid ones."""
 
         def on_message(data: bytes) -> None:
             try:
@@ -288,9 +290,9 @@ class PolicyNode(Node):
             self._responder.note_phase(status.phase, stamp)
 
     def _may_follow(self, status: EpisodeStatus) -> bool:
-        """Return whether a status comes from the known robot, its successor, or a robot that fits.
+        """Return whether the node accepts a status: from its robot, a successor, or one that fits.
 
-        A second robot that does not fit is ignored.
+        A second robot that the policy does not fit is ignored.
         """
         known = self._status
         if known is None or status.is_of_same_robot(known):

@@ -77,14 +77,14 @@ class StampJoin:
         return None
 
     def forget(self) -> None:
-        """Forget all stamps; the next one is the first."""
+        """Forget all stamps, so that the next one may be earlier."""
         self._last = None
         self._pending.clear()
 
     def _is_late(self, delay: int) -> bool:
-        """Return whether a stamp `delay` ns before the last one is a late message.
+        """Return whether a message `delay` ns older than the last complete stamp is late.
 
-        A longer delay means that the simulation was started again.
+        A message that is not late is new, or the simulation was started again.
         """
         if not 0 < delay <= _LONGEST_DELAY:
             return delay == 0
@@ -118,13 +118,13 @@ class Responder:
 
     Attributes:
         policy: The policy of the robot.
-        topics: The topics it needs.
-        join: Joins them by stamp.
-        answered: Commands sent.
-        turned_back: Messages with an earlier stamp than the last one of their topic. A restarted
-            publisher causes one; two publishers cause many.
-        unusable: Invalid messages, and ticks without a valid observation.
-        failed: Observations for which the policy failed.
+        topics: The topics that the policy needs.
+        join: The `StampJoin` of these topics.
+        answered: Number of commands sent.
+        turned_back: Number of messages with an earlier stamp than the last one of their topic. A
+            restarted publisher causes one; two publishers cause many.
+        unusable: Number of invalid messages, and of ticks without a valid observation.
+        failed: Number of observations for which the policy failed.
         last_failure: Error of the last failure.
         inference: Wall-clock time from a complete observation to its command.
         received_at: Time of the last complete observation, seconds of the clock.
@@ -194,7 +194,7 @@ class Responder:
             self._due, self._due_stamp = vectors, stamp
 
     def note_phase(self, phase: Phase, stamp: int) -> None:
-        """Note the start and end of episodes from `episode_status`, stamped in nanoseconds."""
+        """Note that an episode starts or ends, from an `episode_status` stamped in nanoseconds."""
         if phase == 'finished':
             self._ends_at = stamp
         elif phase == 'reset':
@@ -213,8 +213,8 @@ class Responder:
     def answer(self) -> None:
         """Answer the tick that is due, if any.
 
-        After a failure the policy gets the same tick once a second, until a newer one is complete:
-        in lockstep the robot waits for this answer.
+        After a failure the policy tries the same tick once a second, until a newer one is complete.
+        Otherwise a robot in lockstep would wait for ever.
 
         Raises:
             ValueError: If the policy fails. The failure is counted.
@@ -233,7 +233,7 @@ class Responder:
         self._answered, self._asked = (self._due_stamp, self._asked), None
 
     def send_unsent(self) -> None:
-        """Send the last command if it was not sent yet."""
+        """Send the last command if it has not been sent, for example for lack of a subscriber."""
         if self._unsent is not None and self._send(self._unsent):
             self._unsent = None
             self.answered += 1
@@ -260,7 +260,7 @@ class Responder:
             raise ValueError(f'no observation: {one_line(error)}') from None
 
     def _command(self, observation: Vectors) -> NDArray[np.float64]:
-        """Return the command (action size,), in command units."""
+        """Return the command for an observation, (action size,), in the units of `commands`."""
         action, self._state = self.policy.predict(observation, self._state)
         command = command_from_action(self._robot, action.astype(np.float64))
         return np.asarray(command, dtype=np.float64)

@@ -44,7 +44,7 @@ class ActorInfo:
     """The metadata of an actor.
 
     Attributes:
-        task: Task of its training.
+        task: Task that the actor was trained on.
         observation_layout: (name, size) of each part of the observation, in order.
         goal_size: Length of the goal.
         action_size: Length of the action.
@@ -57,7 +57,7 @@ class ActorInfo:
         env_steps: Environment steps of the training.
         config: Training configuration by field.
         success: Measured success and how it was measured; empty if unmeasured.
-        goal_features: Inputs made from observation and goal: `plain`, `relative`, `symmetric`.
+        goal_features: Kind of the network inputs: `plain`, `relative` or `symmetric`.
         init_from: Name, task, environment steps and `init_from` of the networks that its training
             started from; empty for random networks.
         past_actions: Number of past actions among the inputs.
@@ -82,7 +82,7 @@ class ActorInfo:
 
     @property
     def shape(self) -> NetworkShape:
-        """Shape of its network."""
+        """Sizes and inputs of the actor's network."""
         return NetworkShape(
             observation_size=sum(size for _, size in self.observation_layout),
             goal_size=self.goal_size,
@@ -126,7 +126,7 @@ def to_bytes(actor: Actor, info: ActorInfo) -> bytes:
 
 
 def to_metadata(info: ActorInfo) -> dict[str, str]:
-    """Return the metadata of a checkpoint or ONNX file."""
+    """Convert `info` to the metadata of a checkpoint or ONNX file, as texts by name."""
     metadata = {'format': FORMAT, 'format_version': str(FORMAT_VERSION)}
     for name, value in dataclasses.asdict(info).items():
         metadata[name] = json.dumps(value)
@@ -188,7 +188,7 @@ def parse_metadata(metadata: dict[str, str], path: str | Path) -> ActorInfo:
     """Return the checked metadata of a checkpoint or ONNX file.
 
     Raises:
-        ValueError: If they have another version or do not fit a task. `path` names the file.
+        ValueError: If they have another version or do not fit a task. The message names `path`.
     """
     _check_format(path, metadata)
     if sum(map(len, metadata.values())) > LARGEST_HEADER:
@@ -272,7 +272,7 @@ def _check_tensors(
 
 
 def _of_type(kind: type, name: str) -> Callable[[object], Any]:
-    """Return a function that returns a value of the type `kind` and raises ValueError for others.
+    """Return a function that returns values of the type `kind` and raises TypeError for others.
 
     Booleans are not numbers. `name` is the name of the type in the error.
     """

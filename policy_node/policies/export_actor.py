@@ -63,11 +63,11 @@ def export(source: Path, target: Path) -> float:
     """Write a checkpoint as ONNX; the file is complete and checked, or not written.
 
     Returns:
-        The largest difference between the actions of both on random observations.
+        The largest difference between the actions of both files on random observations.
 
     Raises:
         ValueError: If the checkpoint is invalid or has past actions.
-        CommandError: If actions differ.
+        CommandError: If this difference is too large.
         OSError: If the file cannot be written.
     """
     import onnx

@@ -62,9 +62,9 @@ def write_file(path: Path, data: bytes) -> None:
 
 
 def write_files(files: Mapping[Path, bytes]) -> None:
-    """Write files that belong together: replace none before all are on disk.
+    """Write files that belong together; no file is replaced before all new ones are on disk.
 
-    If two processes write at once, each file is whole and comes from the last one.
+    If two processes write at once, each file is complete and comes from one of them.
 
     Raises:
         OSError: If writing fails. The error names the file, and no partial file remains.
@@ -90,7 +90,7 @@ def write_files(files: Mapping[Path, bytes]) -> None:
 
 @contextlib.contextmanager
 def _named(path: Path) -> Iterator[None]:
-    """Add the path to an OSError raised in the body; Python leaves it out for a full disk."""
+    """Add the path to an OSError of the block; Python leaves it out if the disk is full."""
     try:
         yield
     except OSError as error:

@@ -1,4 +1,4 @@
-"""Network inputs made from observation and goal: the difference to the goal, object symmetry.
+"""Network inputs made from observation and goal, for differences to the goal and symmetry.
 
 The inputs are functions of observation and goal alone and add no information. They spare the
 network from learning quaternion products and symmetries. The same functions serve NumPy arrays
@@ -67,7 +67,7 @@ class RelativeGoal:
         return concatenate(*normalized, self.difference(*seen))
 
     def goal_position(self, observation_size: int, size: int) -> list[int]:
-        """Return which of the `size` network inputs depend on the goal position (pose goals)."""
+        """Return the indices of the network inputs that depend on the position of a pose goal."""
         return [*range(observation_size, observation_size + 3), *range(size - 3, size)]
 
     def difference(self, observation: Array, goal: Array) -> Array:
@@ -125,7 +125,7 @@ class SymmetricObject:
         )
 
     def goal_position(self, observation_size: int, size: int) -> list[int]:
-        """Return which of the `size` network inputs depend on the goal position (pose goals)."""
+        """Return the indices of the network inputs that depend on the position of a pose goal."""
         del observation_size
         return [*range(size - 3, size)]
 
@@ -135,7 +135,7 @@ GoalFeatures = RelativeGoal | SymmetricObject
 
 
 def goal_features(kind: str, spec: TaskSpec) -> GoalFeatures | None:
-    """Return the features `kind` of a task; None for `plain`, observation and goal unchanged.
+    """Return the features `kind` of a task; None for `plain`, the unchanged observation and goal.
 
     Raises:
         ValueError: If the kind is unknown, or the task has no symmetric object.
@@ -214,7 +214,7 @@ def _z_axis(quaternion: Array) -> Array:
 
 
 def _library(array: Array) -> ModuleType:
-    """Return the module of an array, numpy or torch; both have the functions used here."""
+    """Return `numpy` or `torch`, the library of an array; both have the functions used here."""
     if isinstance(array, np.ndarray):
         return np
     import torch

@@ -34,7 +34,7 @@ _SUFFIXES = ('.safetensors', '.onnx', '.zip')
 
 
 def shipped_actors() -> dict[str, Path]:
-    """Return task name -> checkpoint of the actors in this package."""
+    """Return the checkpoint files of the actors in this package, by name."""
     folder = Path(__file__).parents[1] / 'actors'
     # `<task>.training.safetensors` contains the critic of an actor.
     files = sorted(folder.glob('*.safetensors'))
@@ -42,7 +42,7 @@ def shipped_actors() -> dict[str, Path]:
 
 
 def shipped_name(task: str, kind: str) -> str:
-    """Return the name of the shipped policy of a task: the usual one (kind ''), or `robust`."""
+    """Return the name of a task's shipped policy: the usual one (`kind` '') or the robust one."""
     return f'{task}_{kind}' if kind else task
 
 
@@ -97,7 +97,7 @@ POLICY_NAMES = (
 
 
 class TaskMissing(ValueError):
-    """A policy that does not name its task was loaded without a task."""
+    """Raised if a policy is loaded without a task, and it does not name one itself."""
 
 
 def load_actor(name_or_path: str | Path, task: str | None = None) -> Actor:
@@ -176,7 +176,7 @@ def _shipped(task: str | None, kind: str) -> Path:
 
 
 def _read(path: Path, task: str | None, trust: bool) -> LoadedPolicy:
-    """Load a policy file by its suffix; import only the libraries that this format needs."""
+    """Load a policy file according to its suffix; import only the libraries of this format."""
     if path.suffix == '.onnx':
         from policy_node.policies.onnx import load_onnx
 
@@ -205,7 +205,7 @@ def _require_task(name: str, task: str | None) -> str:
 
 
 class _FunctionPolicy(MemorylessPolicy):
-    """A function from one observation to one action; it gets a batch row by row."""
+    """A policy made of a function from one observation to one action; it splits batches."""
 
     def __init__(self, function: Callable[[Observation], Any]) -> None:
         self._function = function
@@ -223,15 +223,16 @@ class _FunctionPolicy(MemorylessPolicy):
 
 
 def is_python_name(name: str) -> bool:
-    """Return whether this names a function of a module, such as `my_policies.reach:make`."""
+    """Return whether a name has the form `module:function`, as `my_policies.reach:make`."""
     return _PYTHON_NAME.fullmatch(name) is not None
 
 
 @contextlib.contextmanager
 def working_directory_first() -> Iterator[None]:
-    """Put the working directory first in `sys.path` for the body, and last afterwards.
+    """Put the working directory first in `sys.path` during the block, and last after it.
 
-    Executables search their own folder first. Later imports find their own modules again.
+    Executables otherwise search their own folder first. In the last place, the directory hides no
+    installed module from later imports.
     """
     here = os.getcwd()
     sys.path.insert(0, here)
@@ -243,7 +244,7 @@ def working_directory_first() -> Iterator[None]:
 
 
 def _load_python(name: str, task: str) -> LoadedPolicy:
-    """Import a module, also from the working directory, and call its function with the task."""
+    """Import a module, also from the working directory; call its function with the task."""
     module_name, _, function_name = name.partition(':')
     try:
         with working_directory_first():

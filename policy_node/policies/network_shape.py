@@ -29,7 +29,7 @@ class NetworkShape:
         observation_size: Length of `observation`.
         goal_size: Length of `desired_goal`.
         layer_norm: Whether a LayerNorm precedes each activation.
-        goal_features: Inputs made from observation and goal; None for the plain ones.
+        goal_features: Function for the network inputs; None uses observation and goal unchanged.
         past_actions: Number of past actions among the inputs, after the observation.
     """
 
@@ -68,7 +68,7 @@ class NetworkShape:
 
         Args:
             given: Observation with past actions (..., input_size), and goal (..., goal_size).
-            normalized: The same, normalised.
+            normalized: The same observation and goal, normalised.
         """
         if self.goal_features is None:
             return concatenate(*normalized)
@@ -77,7 +77,7 @@ class NetworkShape:
         return concatenate(inputs, seen[..., size:]) if self.past_actions else inputs
 
     def hidden_names(self) -> list[tuple[str, str]]:
-        """Return the names in `Actor` of each hidden layer and of the LayerNorm after it."""
+        """Return the names of each hidden layer and of its LayerNorm in the state of an `Actor`."""
         stride = 3 if self.layer_norm else 2
         places = range(0, stride * len(self.hidden_sizes), stride)
         return [(f'network.hidden.{i}', f'network.hidden.{i + 1}') for i in places]
@@ -100,12 +100,12 @@ class NetworkShape:
 
 
 class NetworkPolicy:
-    """A deterministic policy of a network; subclasses compute the action."""
+    """Base class of deterministic policies with a network; subclasses implement `act`."""
 
     shape: NetworkShape
 
     def act(self, seen: NDArray[np.float32], goal: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return actions (..., action_size) for inputs (..., input_size) and goals."""
+        """Return actions (..., action_size) for `seen` (..., input_size) and `goal`."""
         raise NotImplementedError
 
     def predict(

@@ -1,4 +1,4 @@
-"""The actor in NumPy alone, for running: it loads seconds faster than torch and answers faster.
+"""The actor in NumPy, for running: it loads seconds faster than torch and computes faster.
 
 It computes in float64 with the float32 weights and rounds the action to float32. So the batch size
 and the order of sums rarely change more than the last bit. torch computes in float32;
@@ -47,7 +47,7 @@ class NumpyActor(NetworkPolicy):
         self._values = {name: values.astype(np.float64) for name, values in tensors.items()}
 
     def act(self, seen: NDArray[np.float32], goal: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return actions (..., action_size) for inputs (..., input_size) and goals."""
+        """Return actions (..., action_size) for `seen` (..., input_size) and `goal`."""
         # Rounded to float32 first, as in training.
         given = seen.astype(np.float64), goal.astype(np.float64)
         normalized = (
@@ -84,7 +84,7 @@ class NumpyActor(NetworkPolicy):
 
 @cache
 def _blas() -> ThreadpoolController:
-    """Return the libraries of NumPy's matrix products."""
+    """Return a controller of the threads of NumPy's matrix products."""
     return ThreadpoolController().select(user_api='blas')
 
 
@@ -92,7 +92,7 @@ def load_checkpoint(path: Path, task: str | None = None) -> LoadedPolicy:
     """Load a checkpoint for running.
 
     Raises:
-        ValueError: As `checkpoint.read`.
+        ValueError: If the file is invalid, of an unknown version, or of another task.
     """
     found = checkpoint.read(path, task)
     actor = NumpyActor(found.info.shape, found.tensors)

@@ -1,4 +1,4 @@
-"""The interface of policies, `LoadedPolicy` with checked answers, two untrained policies."""
+"""The interface of policies, `LoadedPolicy` with checked actions, and two untrained policies."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Observation = Mapping[str, ArrayLike]
 
 
 class Policy(Protocol):
-    """A policy with the `predict` of Stable-Baselines3."""
+    """Interface of policies: a method `predict` as in Stable-Baselines3."""
 
     def predict(
         self,
@@ -32,7 +32,7 @@ class Policy(Protocol):
                 (..., goal size) in the units of the task.
             state: State that the last call returned; None at the start of an episode.
             episode_start: Booleans (...,), True where an episode starts.
-            deterministic: Without exploration noise.
+            deterministic: Whether to act without exploration noise.
 
         Returns:
             Actions (..., action size) in [-1, 1], and the state for the next call; None for a
@@ -47,14 +47,14 @@ class PolicyError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class LoadedPolicy:
-    """A policy for one task, whose answers are checked.
+    """A policy for one task, whose actions are checked.
 
     Attributes:
         policy: The policy itself, unchecked.
         task: Name of the task.
         description: Format and file name, for logs and errors.
         control_hz: Action frequency of its training, Hz; None if any frequency is allowed.
-        sha256: SHA-256 of its file, or files one after the other; empty without a file.
+        sha256: SHA-256 of its file, or of its concatenated files; empty without a file.
         is_bounded: Whether actions outside [-1, 1] are errors.
     """
 
@@ -164,7 +164,7 @@ class RandomPolicy(MemorylessPolicy):
 
 
 class RestingPolicy(MemorylessPolicy):
-    """The zero action: the gripper stays, the hand takes the middle of its ranges."""
+    """Policy of the zero action: the gripper stays, and the hand moves to its middle position."""
 
     def __init__(self, action_size: int) -> None:
         self._action_size = action_size
@@ -252,6 +252,6 @@ def past_before(
 
 
 def past_after(past: NDArray[np.float32], action: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the past actions with `action` (..., action size) put first and the oldest dropped."""
+    """Return `past` with `action` (..., action size) inserted first and the oldest one dropped."""
     kept = past[..., : past.shape[-1] - action.shape[-1]]
     return np.concatenate([action, kept], axis=-1).astype(np.float32)

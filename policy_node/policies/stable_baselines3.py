@@ -1,4 +1,4 @@
-"""Models of Stable-Baselines3, trained on the same dict observation: its `.zip` files.
+"""Policies in `.zip` files of Stable-Baselines3, trained on the observations of this package.
 
 **Such a file contains pickles, and loading it can run code**: load only files of authors you trust.
 It contains neither task nor action frequency, so only sizes are checked. A model that was trained
@@ -48,10 +48,10 @@ _STATISTICS = ('vecnormalize.pkl', 'vec_normalize.pkl')
 
 
 class StableBaselines3Policy:
-    """A policy of a model; by default it acts without exploration.
+    """The policy of a Stable-Baselines3 model; by default it acts without exploration noise.
 
     Args:
-        statistics: `VecNormalize` of its training, or None.
+        statistics: The `VecNormalize` that the model was trained with, or None.
     """
 
     def __init__(self, policy: Any, statistics: Any = None) -> None:
@@ -74,7 +74,7 @@ class StableBaselines3Policy:
 
 
 def load_stable_baselines3(path: Path, task: str) -> LoadedPolicy:
-    """Load a model for running; this can run code in its file.
+    """Load a model for running; this can run code that the file contains.
 
     Raises:
         ValueError: If the library is missing, the file is invalid or its sizes do not fit the task.
@@ -107,7 +107,7 @@ def load_stable_baselines3(path: Path, task: str) -> LoadedPolicy:
 
 
 def _statistics_file(path: Path) -> Path | None:
-    """Return the file of `VecNormalize` beside a model, or None.
+    """Return the file with the `VecNormalize` statistics beside a model, or None.
 
     `CheckpointCallback` writes `a_vecnormalize_9_steps.pkl` for `a_9_steps.zip`.
     """
@@ -118,7 +118,7 @@ def _statistics_file(path: Path) -> Path | None:
 
 
 def _statistics(file: Path, content: bytes) -> Any:
-    """Load the `VecNormalize` of a training; this can run code in its file."""
+    """Load the `VecNormalize` of a training run; this can run code that the file contains."""
     try:
         statistics = pickle.loads(content)
     except Exception as error:
