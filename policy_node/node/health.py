@@ -69,7 +69,7 @@ class Health:
         self._said: set[str] = set()
 
     def start(self, responder: Responder, status: EpisodeStatus, now: float) -> None:
-        """Begin to report on a robot; `now` is in seconds of the responder's clock."""
+        """Begin to report on a robot; `now` is the time of the responder's clock, in seconds."""
         self._responder, self._then = responder, now
         self._tick_duration = 1.0 / status.control_hz
         self._increases.clear()

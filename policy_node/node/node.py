@@ -77,10 +77,10 @@ class PolicyNode(Node):
         self.add_on_set_parameters_callback(self._take_policy)
 
     def run(self, stop: StopSignals) -> None:
-        """Serve until `stop` is set.
+        """Answer robots until `stop` is set.
 
         Raises:
-            NodeFailure: If the policy does not fit the robot.
+            NodeFailure: If no policy is found, or the policy does not fit the robot.
         """
         loop = EventLoop(self)
         self.get_logger().info(f'waiting for a robot on {self._status_name}')
@@ -110,7 +110,7 @@ class PolicyNode(Node):
         responder.send_unsent()
 
     def _load_ahead(self) -> LoadedPolicy | None:
-        """Load the policy before a robot is found, so that errors show at once."""
+        """Load the policy at the start, so that errors show early; None if its task is unknown."""
         settings = self._settings
         try:
             return load_policy(

@@ -30,11 +30,11 @@ _LATEST = 1.0
 
 
 class StampJoin:
-    """Collect the vectors of several topics until one stamp has all of them.
+    """Collect the vectors of several topics until all of them have arrived with the same stamp.
 
-    A complete stamp drops all earlier stamps, because a policy needs the newest state only. A much
-    earlier stamp that becomes complete means that the simulation was started again. A single
-    message with an odd stamp from another publisher has no effect.
+    Such a stamp is complete. It drops all earlier stamps, because a policy needs the newest state
+    only. A much earlier stamp that becomes complete means that the simulation was started again. A
+    single message with a wrong stamp from another publisher has no effect.
 
     Args:
         topics: Names of the topics to join.

@@ -18,7 +18,7 @@ from policy_node.policies.network_shape import (
 
 
 class MLP(nn.Module):
-    """Hidden layers with ReLU and a linear output; Glorot weights, zero biases.
+    """Multilayer perceptron: hidden layers with ReLU, linear output, Glorot weights, zero biases.
 
     The initialisation equals that of the paper's code (`baselines/her/util.py`). The output layer
     stays float32 under autocast, because bfloat16 rounds values near -50 to steps of 0.25.
@@ -38,7 +38,7 @@ class MLP(nn.Module):
         self.output = _linear(size, output_size)
 
     def forward(self, inputs: Tensor) -> Tensor:
-        """Return (..., output_size), float32."""
+        """Return the outputs (..., output_size), float32, for inputs (..., size)."""
         hidden = self.hidden(inputs).float()
         with torch.autocast(hidden.device.type, enabled=False):
             output: Tensor = self.output(hidden)
@@ -55,7 +55,7 @@ def _linear(input_size: int, output_size: int) -> nn.Linear:
 class Normalizer(nn.Module):
     """Normalize network inputs with the mean and standard deviation of a checkpoint.
 
-    During training, `policy_node.training.experience.experience.RunningStatistics` sets them.
+    During training, `policy_node.training.experience.experience.RunningStatistics` sets both.
     """
 
     mean: Tensor

@@ -96,7 +96,7 @@ class ActorInfo:
 
 @dataclass(frozen=True, slots=True)
 class Checkpoint:
-    """The checked contents of a file.
+    """The checked contents of a checkpoint file.
 
     Attributes:
         info: The metadata.

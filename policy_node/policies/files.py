@@ -1,4 +1,4 @@
-"""Read and write the files of policies and runs: whole, and within size limits."""
+"""Read files of policies and runs within size limits; write them completely or not at all."""
 
 from __future__ import annotations
 

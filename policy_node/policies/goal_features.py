@@ -62,7 +62,7 @@ class RelativeGoal:
 
         Args:
             seen: Observation and goal, (..., size) each, in the units of the task.
-            normalized: Both, normalised.
+            normalized: The same observation and goal, normalised.
         """
         return concatenate(*normalized, self.difference(*seen))
 
@@ -109,7 +109,7 @@ class SymmetricObject:
         Args:
             seen: Observation and goal, (..., size) each, in the units of the task. The observation
                 ends with the object's velocity and pose.
-            normalized: Both, normalised.
+            normalized: The same observation and goal, normalised.
         """
         (observation, goal), (normalized_observation, _) = seen, normalized
         start = self.relative.start
@@ -228,12 +228,12 @@ def concatenate(*parts: Array) -> Array:
 
 
 def _like(array: Array, values: list[float]) -> Array:
-    """Return the values as an array of the library, type and device of `array`."""
+    """Return `values` as an array with the library, data type and device of `array`."""
     return np.asarray(values) if isinstance(array, np.ndarray) else array.new_tensor(values)
 
 
 def _parts(array: Array) -> list[Array]:
-    """Split an array into its entries along the last axis."""
+    """Split an array along its last axis into arrays without this axis."""
     return [array[..., i] for i in range(array.shape[-1])]
 
 

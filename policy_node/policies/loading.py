@@ -51,7 +51,7 @@ def actor_path(name_or_path: str | Path, others: Sequence[str] = ()) -> Path:
 
     Args:
         name_or_path: Name of a shipped actor, or a path.
-        others: Further names that the caller accepts, for the error.
+        others: Further names that the caller accepts, listed in the error message.
 
     Raises:
         ValueError: If neither exists. The message lists the shipped actors; for the folder of a

@@ -57,7 +57,7 @@ class OnnxActor(NetworkPolicy):
         self._check_sizes(path)
 
     def act(self, seen: NDArray[np.float32], goal: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return actions (..., action size) for observations and goals."""
+        """Return actions (..., action size) for `seen` and `goal`, (..., size) each."""
         flat = [part.reshape(-1, part.shape[-1]) for part in (seen, goal)]
         (action,) = self._session.run([OUTPUT], dict(zip(INPUTS, flat, strict=True)))
         return np.asarray(action, np.float32).reshape(*seen.shape[:-1], -1)
@@ -78,7 +78,7 @@ def load_onnx(path: Path, task: str | None = None) -> LoadedPolicy:
     """Load an ONNX file for running.
 
     Raises:
-        ValueError: If it is invalid, needs too much memory or time, or was trained on another task.
+        ValueError: If the file is invalid, needs too much memory or time, or has another task.
     """
     data = read_file(path)
     if _EXTERNAL.search(data):

@@ -42,7 +42,7 @@ class Policy(Protocol):
 
 
 class PolicyError(ValueError):
-    """A policy failed or returned an invalid action; the message is one line."""
+    """Raised if a policy fails or returns an invalid action; the message is one line."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,7 +143,7 @@ _ACTION_STREAM = 1
 
 
 class RandomPolicy(MemorylessPolicy):
-    """Uniformly random actions, equal for equal seeds."""
+    """Policy of uniformly random actions, which are equal for equal seeds."""
 
     def __init__(self, action_size: int, seed: int = 0) -> None:
         self._action_size = action_size

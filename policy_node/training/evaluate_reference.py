@@ -1,4 +1,4 @@
-"""`evaluate_reference`: success of a policy in Gymnasium-Robotics itself, by its `is_success`.
+"""`evaluate_reference`: measure the success of a policy in Gymnasium-Robotics (`is_success`).
 
 On MuJoCo >= 3.17 an `assert` of that package fails, because it compares an enum with a NumPy
 integer. So run without asserts: `python -O -m policy_node.training.evaluate_reference`.

@@ -143,7 +143,7 @@ class Workers:
 
 
 def is_first_worker() -> bool:
-    """Return whether this process is worker 0; for use before `join_workers`."""
+    """Return whether this process is worker 0; works before `join_workers`."""
     return os.environ.get('RANK', '0') == '0'
 
 

@@ -70,7 +70,7 @@ def policy_errors() -> Iterator[None]:
 
 
 def make_chosen_simulation(options: argparse.Namespace, loaded: LoadedPolicy) -> Simulation:
-    """Return the simulations for a policy that the options of `add_simulation_options` choose.
+    """Return the simulations for a policy, with the options of `add_simulation_options`.
 
     Raises:
         UsageError: If an option does not fit the policy.

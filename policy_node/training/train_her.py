@@ -61,7 +61,7 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
 def config_from_arguments(options: argparse.Namespace) -> TrainConfig:
     """Return the configuration that the options choose.
 
-    It is the recipe or the resumed run, changed by the options and by `--set`.
+    It is that of the recipe or the resumed run, changed by the options and by `--set`.
 
     Raises:
         ValueError: If a value is missing, unknown or not allowed.

@@ -389,7 +389,7 @@ class Field:
     """One field of `TrainConfig`, for help texts and parsing.
 
     Attributes:
-        group: Title of its group in the help.
+        group: Title of its group of fields in `--help`.
         meaning: Description of the field, on one line.
         kind: Type of the field, without its range.
         choices: Allowed values if the field has a fixed set of them, else an empty tuple.
@@ -437,7 +437,7 @@ def _describe() -> Iterator[Field]:
 
 
 def _parts(hint: Any) -> tuple[Any, tuple[str, ...], Range | None]:
-    """Return the plain type, the choices and the range of an annotation."""
+    """Return the plain type, the choices and the range that a type annotation contains."""
     if typing.get_origin(hint) is Literal:
         return str, typing.get_args(hint), None
     is_ranged = typing.get_origin(hint) is Annotated

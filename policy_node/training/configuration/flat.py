@@ -83,7 +83,7 @@ def from_flat(fields: Mapping[str, Any], **changes: Any) -> TrainConfig:
 
 
 def changed(config: TrainConfig, **changes: Any) -> TrainConfig:
-    """Return a copy of a configuration with fields replaced.
+    """Return a copy of a configuration with the fields in `changes` replaced.
 
     Raises:
         ValueError: If a field is unknown, or a value is not allowed or has no effect.

@@ -35,7 +35,7 @@ def steps_at_rate(values: Mapping[str, Any], control_hz: float) -> dict[str, Any
 
 
 def recipe_config(task: str, recipe: str, **overrides: Any) -> TrainConfig:
-    """Return the configuration of a recipe for a task, with fields replaced.
+    """Return the configuration of a recipe for a task, with the fields in `overrides` replaced.
 
     Args:
         recipe: `paper` (Plappert et al. 2018, appendix B), `best` (the best measured here from

@@ -105,8 +105,8 @@ class Collector:
         """Run one episode in every simulation.
 
         Returns:
-            The episodes, without those whose simulation diverged, and the share of them that
-            succeeded at the last step (0 if all diverged).
+            The episodes whose simulation did not diverge, and their success rate at the last step
+            (0 if all diverged).
         """
         simulation = self.simulation
         spec = simulation.spec

@@ -30,7 +30,7 @@ SMALLEST_STD = 0.01
 
 
 class RunningStatistics(nn.Module):
-    """Running sums of network inputs; a `Normalizer` gets its mean and deviation from them."""
+    """Running sums of network inputs, from which a `Normalizer` gets its mean and deviation."""
 
     count: Tensor
     total: Tensor
@@ -156,7 +156,7 @@ class Experience:
         return chosen.sample(replay.episodes, row, mixture, self.generator, replay.valid_ticks)
 
     def _draw_rows(self) -> NDArray[np.int64]:
-        """Draw an episode for each transition of a batch; return rows of the replay, (batch,)."""
+        """Draw an episode for each transition; return its row in the replay, (batch,)."""
         return self.replay.draw(self.batch_size, self.config.moved_share, self.generator)
 
     def mixture(self) -> dict[str, float]:

@@ -227,7 +227,7 @@ class Transitions:
 
     Attributes:
         observation: (batch, observation_size).
-        next_observation: (batch, observation_size), one step later, or at the end of an n-step
+        next_observation: (batch, observation_size), one step later, or n steps later for an n-step
             return.
         goal: (batch, goal_size), after relabelling.
         action: (batch, action_size).

@@ -72,10 +72,10 @@ def own_reward(metric: GoalMetric) -> str:
 
 
 def narrowed(metric: GoalMetric, config: TrainConfig, progress: float) -> GoalMetric:
-    """Return `metric` with the success thresholds to use at this progress of a run, 0 ... 1.
+    """Return `metric` with the success thresholds for this progress of a run, 0 ... 1.
 
-    Thresholds start wider by `first_distance` and `first_rotation` and reach those of the task at
-    two thirds of the run.
+    At the start, thresholds are multiplied by `first_distance` and `first_rotation`. They reach
+    those of the task after two thirds of the run.
     """
     left = max(1.0 - 1.5 * progress, 0.0)
     distance, rotation = config.first_distance**left, config.first_rotation**left

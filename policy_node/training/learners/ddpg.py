@@ -207,7 +207,7 @@ class DDPG(ActorCritic):
         return value
 
     def _penalty(self, batch: TensorBatch, action: Tensor) -> Tensor:
-        """Return the term that is added to the actor's loss: the mean squared action, weighted."""
+        """Return the penalty in the actor's loss: the mean squared action times `action_l2`."""
         del batch
         cost: Tensor = self.config.action_l2 * action.float().square().mean()
         return cost

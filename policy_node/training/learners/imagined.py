@@ -3,14 +3,15 @@
 Chane-Sane et al. 2021, "Goal-Conditioned Reinforcement Learning with Imagined Subgoals" (RIS, arXiv
 2107.00541). The actor learns near goals before distant ones. So its action for a distant goal is
 drawn towards its action for a subgoal on the way. A network h imagines that subgoal. For a state s
-and a goal g, h learns from several visited states s'. The best ones have the least
+and a goal g, h learns from several visited states s', its candidates. The best candidates have the
+lowest
 
-    cost(s') = max(-V(s, g'), -V(s', g)),     g' is the goal achieved in s',
+    cost(s') = max(-V(s, g'), -V(s', g)),     g' is the goal achieved in s'.
 
-and their weights are the softmax of -cost. The loss of the actor gets the mean of (a - a')^2 times
-`subgoal_prior`; a' is the action of the target actor for h(s, g). As in RIS the acting policy does
-not use h. Unlike RIS, the weights compare the candidates of a state with each other, not with h. So
-V is evaluated only for visited states.
+The weights of candidates are the softmax of -cost. The mean of (a - a')^2 times `subgoal_prior` is
+added to the loss of the actor, where a' is the action of the target actor for h(s, g). As in RIS,
+the acting policy does not use h. Unlike in RIS, the weights compare the candidates of a state with
+each other, not with h. So V is evaluated only for visited states.
 """
 
 from __future__ import annotations

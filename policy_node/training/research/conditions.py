@@ -168,7 +168,7 @@ class ConditionedDDPG(DDPG):
 
 
 def fold(network: MLP, shape: NetworkShape, value: float) -> MLP:
-    """Return a network without its last input, which is fixed at `value`.
+    """Return a copy of a network without its last input, as if it always were `value`.
 
     Args:
         network: Its first layer has `shape.feature_size` + 1 inputs.

@@ -149,10 +149,10 @@ def quantile_costs(quantiles: Tensor, target: Tensor) -> Tensor:
 
 
 class BatchNormLoss(EnsembleLoss):
-    """Critics with a batch normalization, as in CrossQ (arXiv 1902.05605).
+    """Critics with batch normalization, as in CrossQ (arXiv 1902.05605).
 
-    States and next states go through the critic together. Otherwise the statistics would not
-    include the next actions.
+    States and next states go through the critic in one batch. Otherwise the statistics of the
+    normalization would not include the next actions.
     """
 
     def make_one(self, features: int, shape: NetworkShape) -> Critic:
@@ -223,7 +223,7 @@ class AdvantageCritic(nn.Module):
         return value
 
     def forward(self, features: Tensor, action: Tensor, own: Tensor) -> Tensor:
-        """Return action values (batch,), given the actor's own actions `own`."""
+        """Return the values (batch,) of `action`, given the actor's own actions `own`."""
         gain: Tensor = self.advantage(features, action) - self.advantage(features, own)
         return self.value(features) + self._duration * gain
 

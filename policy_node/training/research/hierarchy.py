@@ -68,12 +68,12 @@ class Proposer:
     is_pose: bool
 
     def normalized(self, observation: Observations) -> Array32:
-        """Return proposals (N, goal size) in standard deviations from the mean."""
+        """Return proposed subgoals (N, goal size) in standard deviations from the mean of goals."""
         share: Array32 = self.policy.predict(observation, deterministic=True)[0]
         return NORMALIZED_CLIP * share
 
     def goals(self, normalized: Array32) -> Array32:
-        """Return goals (N, goal size), float32, from standard deviations from the mean."""
+        """Convert the result of `normalized` to goals (N, goal size), float32."""
         goals = self.mean + self.std * normalized
         if self.is_pose:
             norm = np.linalg.norm(goals[:, 3:], axis=-1, keepdims=True)
@@ -102,7 +102,7 @@ class GuidedPolicy:
         episode_start: Any = None,
         deterministic: bool = True,
     ) -> tuple[NDArray[np.float32], Any]:
-        """Return actions (N, action size) for observations (N, ...) of the next tick."""
+        """Return actions (N, action size) for observations (N, ...); each call is the next tick."""
         del episode_start
         proposer = self.proposer
         if self._tick % self._every == 0:

@@ -99,7 +99,7 @@ class PPO(ActorCritic):
 
     @torch.no_grad()
     def log_probabilities(self, observation: Array32, goal: Array32, action: Array32) -> Array32:
-        """Return the logarithms (...,) of the densities of actions (..., action_size)."""
+        """Return the log densities (...,) of actions (..., action_size) in states with goals."""
         mean = self.actor(self.actor.features(self.tensor(observation), self.tensor(goal)))
         logs = log_probability(mean, self._noise_std, self.tensor(action))
         found: Array32 = logs.cpu().numpy()
@@ -107,11 +107,12 @@ class PPO(ActorCritic):
 
 
 def log_probability(mean: Tensor, deviation: float, action: Tensor) -> Tensor:
-    """Return the logarithm (...,) of the density of a noisy action clipped to [-1, 1].
+    """Return the log density (...,) of a noisy action that is clipped to [-1, 1].
 
     Args:
-        mean: (..., action_size).
-        action: (..., action_size), clipped.
+        mean: Action without noise, (..., action_size).
+        deviation: Standard deviation of the noise.
+        action: Clipped action with noise, (..., action_size).
     """
     inside = -0.5 * ((action - mean) / deviation).square() - math.log(deviation * _ROOT)
     below = torch.special.log_ndtr((-1.0 - mean) / deviation)

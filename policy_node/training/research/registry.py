@@ -65,7 +65,7 @@ _LEARNERS: dict[str, type[DDPG]] = {
 
 
 def make_simulation(config: TrainConfig, num_envs: int, num_threads: int) -> Simulation:
-    """Return `num_envs` simulations of the task."""
+    """Return `num_envs` simulations of the task, with the options that the configuration sets."""
     options: dict[str, Any] = {
         'num_envs': num_envs,
         'num_threads': num_threads,
@@ -78,7 +78,7 @@ def make_simulation(config: TrainConfig, num_envs: int, num_threads: int) -> Sim
 
 
 def make_collector(simulation: Simulation, seeds: list[int], config: TrainConfig) -> Collector:
-    """Return the collector; arguments as `Collector`."""
+    """Return the collector that the configuration selects; arguments as `Collector`."""
     if config.longest_hold > 1:
         return frequent_actions.HoldingCollector(simulation, seeds, config)
     if config.subgoal_every:
@@ -155,7 +155,7 @@ def make_ddpg(
 
 
 def network_shape(config: TrainConfig) -> NetworkShape:
-    """Return the shape of actor and critic."""
+    """Return the sizes and inputs of actor and critic that the configuration selects."""
     return actor_critic.network_shape(config, _extra_actions(config))
 
 

@@ -108,7 +108,7 @@ class RolloutMaker:
         return RolloutTransitions(**flat)
 
     def _under(self, episodes: Episodes, meant: Array32 | None = None) -> dict[str, Array32]:
-        """Compute rewards, values and advantages of episodes for their `desired_goal`.
+        """Compute the transitions of episodes, with advantages, for their `desired_goal`.
 
         Args:
             episodes: Episodes, perhaps with relabelled goals.
@@ -152,8 +152,8 @@ def advantages(
     Args:
         reward: (episodes, T).
         value: (episodes, T + 1); episodes are cut, not terminated, so the last value counts.
-        log_ratio: (episodes, T) log pi(a | s, g') - log pi(a | s, g) of actions for another goal g;
-            None if the actions were for this goal.
+        log_ratio: log pi(a | s, g') - log pi(a | s, g), (episodes, T), for the goal g' of `reward`
+            and the goal g of the actions; None if these goals are the same.
     """
     error = reward + gamma * value[:, 1:] - value[:, :-1]
     ratio = np.ones_like(error)
@@ -173,7 +173,8 @@ def decision_weights(log_ratio: NDArray[np.floating]) -> Array:
     """Return per-decision importance weights (episodes, T), whose mean is 1 at each tick.
 
     Args:
-        log_ratio: (episodes, T) log pi(a | s, g') - log pi(a | s, g).
+        log_ratio: log pi(a | s, g') - log pi(a | s, g), (episodes, T), for the replayed goal g' and
+            the goal g of the actions.
     """
     logs = np.cumsum(log_ratio, axis=1, dtype=np.float64)
     weight = np.exp(logs - logs.max(axis=0))

@@ -61,7 +61,7 @@ def _panel(axes: Any, labels: list[str], measured: list[Any], undisturbed: float
 
 
 def draw_overview(results: Sequence[Mapping[str, Any]]) -> bytes:
-    """Return a PNG with one row per policy: the level of each disturbance that it withstands."""
+    """Return a PNG with a row per policy: the highest level of each disturbance it withstands."""
     from matplotlib.figure import Figure
 
     # Narrow enough for a phone, with a palette that colour-blind readers can tell apart.

@@ -39,7 +39,7 @@ class Answers:
 
     Args:
         capacity: Largest number of rows; new rows replace the oldest.
-        sizes: Lengths of the parts of a row: an input, an action and, if a critic weighs errors,
+        sizes: Lengths of the parts of a row: an input, an action and, if a critic weights errors,
             the features of the true state at which the action takes effect.
     """
 

@@ -141,7 +141,7 @@ class InitialNetworks:
     def _with_critics(self, critics: int) -> InitialNetworks:
         """Return a copy for a run with `critics` critics, whose tensors are named as in that run.
 
-        Surplus critics are left out; missing ones stay missing until `completed`. 0 removes all.
+        Surplus critics are left out, and all if `critics` is 0. `completed` adds missing ones.
         """
         tensors = {n: v for n, v in self.tensors.items() if not n.startswith(_PREFIXES)}
         if not critics:
@@ -166,7 +166,7 @@ class InitialNetworks:
 
 
 def _described(shape: NetworkShape, goal_features: str) -> dict[str, object]:
-    """Return sizes and inputs of networks, by the names used in messages."""
+    """Return sizes and inputs of networks, by the names that error messages use."""
     return {
         'observation': shape.observation_size,
         'goal': shape.goal_size,
@@ -276,7 +276,7 @@ def _unconditioned(tensors: dict[str, Tensor], config: TrainConfig) -> dict[str,
 
 
 def _sums(mean: Tensor, std: Tensor, count: int) -> dict[str, Tensor]:
-    """Return the sums of `RunningStatistics` for `count` inputs of this mean and deviation."""
+    """Return the sums of `RunningStatistics` for `count` inputs with this mean and deviation."""
     number = torch.tensor([float(max(count, 1))], dtype=torch.float64)
     mean, std = mean.double(), std.double()
     square = (std.square() + mean.square()) * number

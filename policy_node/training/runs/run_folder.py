@@ -74,7 +74,7 @@ class RunFolder:
 
     Attributes:
         path: The folder.
-        workers: Rank of this worker. Only the first worker writes actors and the training state.
+        workers: This worker. Only the first worker writes actors and the training state.
         command: Command line or call that started the run, for the record.
         init_from: Origin of the initial networks; empty if they were random.
     """

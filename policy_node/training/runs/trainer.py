@@ -2,7 +2,7 @@
 
 One cycle (`Trainer._run_cycle`) in steps: collect episodes (`collector.collect`), store them
 (`replay.add`, `experience.normalize`), draw batches with relabelled goals (`experience.batch`),
-learn (`learner.update`), evaluate (`evaluator.evaluate`) and keep the best actor.
+learn (`learner.update`), evaluate (`evaluation.evaluate`) and keep the best actor.
 """
 
 from __future__ import annotations

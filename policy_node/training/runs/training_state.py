@@ -79,7 +79,7 @@ class TrainingState:
     """The contents of a training state file.
 
     Attributes:
-        tensors: By part and name, for example `critic.network.output.bias`.
+        tensors: Tensors by part and name, for example `critic.network.output.bias`.
         counters: Progress of the run.
         extra: JSON values: configuration, command, origin of the initial networks.
     """
@@ -304,7 +304,7 @@ def _load_optimizer(optimizer: torch.optim.Adam, tensors: dict[str, Tensor]) -> 
 
 
 class TrainingError(RuntimeError):
-    """Training cannot continue; the message contains the step and the cause."""
+    """Raised if training cannot continue; the message contains the step and the cause."""
 
 
 def require_finite(values: Iterable[tuple[str, Any]], counters: Counters) -> None:

@@ -34,8 +34,8 @@ class Curve:
     """The success of one run over its environment steps, evaluated without noise.
 
     Attributes:
-        env_steps: (n,) ascending, in units of 40 ms.
-        success: (n,) success at the last step.
+        env_steps: Environment steps of 40 ms at each evaluation, (n,), ascending.
+        success: Success rate at the last step in each evaluation, (n,).
     """
 
     env_steps: Array
@@ -105,9 +105,9 @@ def _final_success(job: Job) -> float | None:
 
 
 def area_under(curve: Curve, total_steps: int) -> float:
-    """Return the mean success from step 0 to `total_steps`, linear between evaluations.
+    """Return the mean success from step 0 to `total_steps`, interpolated between evaluations.
 
-    Success rises from 0 before the first evaluation and is constant after the last.
+    Success rises linearly from 0 to the first evaluation and is constant after the last one.
     """
     inside = curve.env_steps <= total_steps
     return _mean_until(float(total_steps), curve.env_steps[inside], curve.success[inside])

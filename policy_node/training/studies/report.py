@@ -161,7 +161,7 @@ def format_study(study: Study, arms: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _times(row: Mapping[str, Any]) -> tuple[str, str, str]:
-    """Return the cells of processor time, area in equal time and samples per second."""
+    """Return the table cells of processor time, area in equal time and samples per second."""
     if not row['timed']:
         return ('-',) * 3
     some = '' if row['timed'] == row['seeds'] else f', of {row["timed"]}'
@@ -173,7 +173,7 @@ def _times(row: Mapping[str, Any]) -> tuple[str, str, str]:
 
 
 def _against(study: Study, row: Mapping[str, Any], arms: Sequence[Mapping[str, Any]]) -> str:
-    """Return the cell that compares a variant with the baseline."""
+    """Return the table cell that compares a variant with the baseline."""
     base = study.arms[0].name
     found = [other for other in arms if (other['task'], other['arm']) == (row['task'], base)]
     if row['arm'] == base or not found:

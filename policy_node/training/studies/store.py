@@ -58,7 +58,7 @@ def add_run(folder: Path, run: Mapping[str, Any]) -> None:
 
 
 def in_order(runs: Iterable[Run], study: Study) -> list[Run]:
-    """Sort runs by task, seed and variant in the order of the study."""
+    """Sort runs by task, seed and variant; tasks and variants keep the order of the study."""
     tasks = {name: index for index, name in enumerate(study.tasks)}
     arms = {arm.name: index for index, arm in enumerate(study.arms)}
 
@@ -83,10 +83,12 @@ def own_fields(study: Study) -> set[str]:
 
 
 def require_alike(study: Study, jobs: Sequence[Job], folder: Path) -> None:
-    """Reject jobs whose configuration differs from the stored runs of the same task.
+    """Check that jobs and the stored runs of the same task have equal configurations.
+
+    Between different variants, the fields of `own_fields` may differ.
 
     Raises:
-        ValueError: The message names one run and the differing fields.
+        ValueError: If they differ; the message names one stored run and the fields.
     """
     own = own_fields(study)
     examples = {(run['task'], run['arm']): run for run in read_runs(folder).values()}

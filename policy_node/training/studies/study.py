@@ -121,7 +121,7 @@ class Study:
         return Path('runs') / ('' if self.ships else 'research') / self.name
 
     def arm(self, name: str) -> Arm:
-        """Return a variant.
+        """Return the variant with this name.
 
         Raises:
             ValueError: If the name is unknown.
@@ -183,7 +183,7 @@ class Job:
         arm: The variant.
         config: The whole configuration.
         folder: Output folder of the training.
-        after: The job that trains the networks this one starts from, or None.
+        after: The job that trains the initial networks of this one, or None.
         final_episodes: Fresh episodes that measure the last actor; 0 measures nothing.
     """
 

@@ -42,7 +42,7 @@ TAKEN = 4
 
 
 class Place(Protocol):
-    """A place where jobs run."""
+    """A place where jobs run: this process, several processes or a Ray cluster."""
 
     limit: int
     """Largest number of jobs at once."""
@@ -139,7 +139,7 @@ def attempt(job: Job, report: Path, command: str) -> int:
 
 
 class ThisProcess:
-    """Run one job after the other in this process."""
+    """Place that runs one job after the other in this process."""
 
     def __init__(self, report: Path, command: str) -> None:
         self.limit = 1
@@ -156,7 +156,7 @@ class ThisProcess:
 
 
 class Processes:
-    """Run several jobs at once, each in a process that prints into `log.txt` of its run.
+    """Place that runs several jobs at once, each in a process that prints to its `log.txt`.
 
     Ctrl-C and SIGTERM are passed on to the processes as SIGTERM. They then finish their cycle and
     save their state, as they do if this process is killed. A second signal ends them at once.
@@ -240,7 +240,10 @@ def _work(job: Job, report: Path, command: str) -> None:
 
 
 class Ray:
-    """Run as many jobs as the cluster has cores for, in folders that all its machines share."""
+    """Place that runs as many jobs as a Ray cluster has cores for.
+
+    All machines of the cluster need access to the same folders.
+    """
 
     def __init__(self, report: Path, command: str) -> None:
         import ray
