@@ -1,4 +1,4 @@
-"""The simulated robots: thirteen tasks in a batched MuJoCo simulation, and its ROS nodes."""
+"""Thirteen robot tasks in a batched MuJoCo simulation, and the ROS nodes around it."""
 
 from node_runtime.signals import guard_loading
 

@@ -27,7 +27,7 @@ _SHUTDOWN_TIMEOUT = 10.0
 def executable(name: str, parent: int | None = None) -> list[str]:
     """Return the command line that runs an executable of this package.
 
-    The started process terminates when the process with the id `parent` does.
+    The started process terminates when the process with the id `parent`, if given, does.
 
     Raises:
         UsageError: If this package runs from its sources and is not installed.

@@ -27,7 +27,7 @@ def add_filter_options(parser: argparse.ArgumentParser) -> None:
 
 
 def is_wanted(options: argparse.Namespace, task: str | None, episode: HasOutcome) -> bool:
-    """Return whether an episode passes the filters; an unknown success passes neither filter."""
+    """Return whether an episode passes; unknown success fails `--success` and `--failure`."""
     return (
         options.task in (None, task)
         and options.success in (None, episode.outcome.is_success)

@@ -1,1 +1,1 @@
-"""Logged episodes as datasets that other libraries read."""
+"""Export logged episodes as datasets that other libraries read."""

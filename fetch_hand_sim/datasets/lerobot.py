@@ -50,7 +50,7 @@ def export_lerobot(
         camera: Camera of the films; None writes no films.
 
     Returns:
-        The folder of each dataset, `directory/<task>`: `LeRobotDataset('me/<task>', root=folder)`.
+        The folder of each dataset by task, for `LeRobotDataset('me/<task>', root=folder)`.
 
     Raises:
         ExportError: If pyarrow is missing, or a dataset exists or cannot be written. Then no

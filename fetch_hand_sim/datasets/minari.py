@@ -105,7 +105,7 @@ def _buffers(
 def _create_dataset(
     minari: Any, dataset_id: str, episodes: Sequence[EpisodeArrays], buffers: Iterator[Any]
 ) -> None:
-    """Write a dataset into `MINARI_DATASETS_PATH`."""
+    """Write one dataset into the folder that the variable `MINARI_DATASETS_PATH` names."""
     # Loads MuJoCo, which other exports do not need.
     from fetch_hand_sim.gym_envs.task_attributes import observation_space
 

@@ -45,7 +45,7 @@ def export_parquet(by_task: ByTask, directory: Path) -> dict[str, list[Path]]:
 
 
 def _tables(pyarrow: Any, episodes: Sequence[EpisodeArrays]) -> tuple[Any, Any]:
-    """Return the tables of steps and of episodes of one task."""
+    """Return the table of all steps and the table of all episodes of one task."""
     steps = [_step_table(pyarrow, index, episode) for index, episode in enumerate(episodes)]
     rows = [_episode_row(index, episode) for index, episode in enumerate(episodes)]
     return pyarrow.concat_tables(steps), pyarrow.Table.from_pylist(rows)

@@ -81,7 +81,7 @@ def active_name(path: Path) -> str | None:
 
 
 def bag_file(directory: Path, name: str) -> Path:
-    """Return the MCAP file of the episode `name` inside its own directory `directory`."""
+    """Return the MCAP file of the episode `name`; `directory` is the directory of this episode."""
     return directory / f'{name}_0.mcap'
 
 
@@ -104,7 +104,7 @@ def is_mcap(path: Path) -> bool:
 
 
 def find_episodes(directory: Path | str) -> list[Path]:
-    """Return the bag directories and MCAP files in a directory, sorted by name, unopened.
+    """Return the bag directories and MCAP files in a directory, sorted by name; open none.
 
     Directories `.<name>.active` and `.<name>.aside` are left out; see `find_leftovers`. An
     unreadable directory raises EpisodeReadError.

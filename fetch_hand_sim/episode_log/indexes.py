@@ -124,7 +124,7 @@ def _check_data_crc(data: bytes, position: int, end: int) -> None:
 
 
 def _check_footer(data: bytes, summary: Summary, summary_start: int) -> None:
-    """Check that the file ends with one footer, which points at the summary and has its CRC."""
+    """Check that the file ends with one footer, which has position and CRC of the summary."""
     footers = summary[Opcode.FOOTER]
     if len(footers) != 1 or footers[0][1] != len(data) - len(MCAP0_MAGIC):
         raise ValueError('truncated or damaged: the file does not end with one footer')
@@ -201,7 +201,7 @@ def _check_chunk_indexes(
 
 
 def _check_chunk_times(contents: Contents, messages: Messages) -> None:
-    """Check the first and last log time that each chunk records; readers skip chunks by them."""
+    """Check the first and last log time of each chunk, which readers use to skip chunks."""
     order = np.argsort(messages.starts)
     starts, times = messages.starts[order], messages.headers['log_time'][order]
     for chunk in contents.chunks:

@@ -89,7 +89,7 @@ class EpisodeRecord:
 
     @property
     def spec(self) -> TaskSpec:
-        """The task with its usual joint names and the `episode_ticks` of the episode."""
+        """The task with its default joint names and the `episode_ticks` of the episode."""
         # Robots up to 1.0 took the same number of ticks at every rate.
         rate = self.control_hz if self.timing == 'seconds' else DEFAULT_CONTROL_HZ
         return task_spec(self.task.name, control_hz=rate)
@@ -100,8 +100,8 @@ class EpisodeOutcome:
     """Contents of the metadata record `episode_result`; None for missing values.
 
     Attributes:
-        received_not_logged: Number of received messages that were not logged, because their topic
-            had too many, by topic.
+        received_not_logged: Number of received messages, by topic, that exceeded a limit and so
+            were not logged.
         late_commands: Steps whose command was not computed from the observation right before; None
             in lockstep, in generated episodes and in files of interface version 1.
     """
@@ -145,7 +145,7 @@ class EpisodeOutcome:
 
 
 class HasOutcome:
-    """Base of classes with the attribute `result`, the record `episode_result` as strings."""
+    """Base of classes whose attribute `result` is the record `episode_result` as strings."""
 
     __slots__ = ()
 
@@ -163,13 +163,13 @@ class HasOutcome:
 
 
 def parse_task(metadata: Strings) -> TaskSpec:
-    """Return the task of an episode with the joint names of its messages, or raise ValueError."""
+    """Return the task with the joint names of the messages; ValueError if it is unknown."""
     name = _text(metadata, 'task')
     return task_spec(name if name in TASKS else name[:_SHOWN], _joint_prefix(metadata))
 
 
 def parse_control_hz(metadata: Strings) -> float:
-    """Return the ticks per simulated second of an episode, or raise ValueError."""
+    """Return the ticks per simulated second; ValueError if missing or not supported."""
     text = _text(metadata, 'control_hz')
     try:
         rate = float(text)

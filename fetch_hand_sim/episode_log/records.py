@@ -251,7 +251,7 @@ class Contents:
             self._take_attachment(data[start:end], position, end - position)
 
     def define(self, opcode: int, content: bytes, offset: int = 0) -> None:
-        """Parse and store a schema or channel record `offset` bytes into its chunk."""
+        """Parse and store a schema or channel; `offset` is its byte offset in the chunk."""
         id = int.from_bytes(content[:2], 'little')
         known = self._definitions.get((opcode, id))
         if known == content:

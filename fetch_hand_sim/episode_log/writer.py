@@ -37,7 +37,7 @@ _NAME = re.compile(r'\.?(?P<task>.+)_(?P<index>\d+)_seed(?P<seed>\d+)(\.active|\
 
 
 class ReceivedAllowance:
-    """Limits the received messages of an episode that are logged, by number and bytes per topic.
+    """Limits how many received messages of an episode are logged, in number and bytes per topic.
 
     `omitted` is the number of messages beyond the limit, by topic.
     """
@@ -52,9 +52,8 @@ class ReceivedAllowance:
     ) -> bool:
         """Count a received message of `size` bytes; return whether to log it.
 
-        Messages that the robot rejected (`is_refused`) may use at most half of the allowance, so
-        that many of them leave room for valid messages. `omitted` lists them as
-        `<topic> (refused)`.
+        Messages that the robot rejected (`is_refused`) may use at most half of the limit, so that
+        there is room for valid messages. `omitted` lists them as `<topic> (refused)`.
         """
         share = 2 if is_refused else 1
         if (
@@ -146,7 +145,7 @@ class EpisodeWriter:
     def write_received(self, topic: TopicSpec, data: bytes, *, is_refused: bool = False) -> bool:
         """Append a message received since the last tick; return whether it is logged.
 
-        `is_refused` marks messages that the robot rejected, which have a smaller allowance.
+        `is_refused` marks messages that the robot rejected, which have a lower limit.
 
         Raises:
             EpisodeLogError: As in `write_tick`.
@@ -175,14 +174,13 @@ class EpisodeWriter:
         return self._is_open and self._bag.has_unflushed
 
     def finish(self, result: Mapping[str, str], reason: str | None = None) -> Path | None:
-        """Complete the bag and return its directory.
+        """Complete the bag and return its directory, or None without messages or after an error.
+
+        If the bag cannot be completed, EpisodeLogError is raised and the hidden directory stays.
 
         Args:
             result: The record `episode_result`; `complete` and `reason` are added.
             reason: Why the episode was cut short; None if it ended normally.
-
-        Returns None if writing failed before or there is no message. If the bag cannot be
-        completed, EpisodeLogError is raised and the hidden directory stays.
         """
         self.end(result, reason)
         return self.store()
@@ -305,7 +303,7 @@ class EpisodeDirectory:
         metadata: Mapping[str, str],
         attachments: Sequence[Attachment] = (),
     ) -> EpisodeWriter:
-        """Return the writer of a new episode; for errors see `EpisodeWriter`."""
+        """Begin the next episode of a task; return its writer. For errors see `EpisodeWriter`."""
         index = self._next[task] if task in self._next else self._first_index(task)
         while True:
             name = episode_name(task, index, seed)

@@ -27,7 +27,7 @@ _FAR = 2.0
 class CommandBuffer:
     """Checks and stores the newest command of one robot.
 
-    The robot holds after `timeout` seconds without a command; 0 means never.
+    The robot holds its position after `timeout` seconds without a command; 0 means never.
 
     Attributes:
         far_out: Number of commands that were far out of range, probably in another unit.

@@ -366,9 +366,9 @@ _LEFT_OUT = frozenset({*_OF_PATHS, 'nbuffer', 'signature'})
 
 
 def model_sha256(model: mujoco.MjModel) -> str:
-    """Return a hash of a compiled model, the same on all machines with one MuJoCo version.
+    """Return a hash of a compiled model; equal models on one MuJoCo version have the same hash.
 
-    It does not depend on the paths of mesh and texture files.
+    It does not depend on the paths of mesh and texture files, which differ between machines.
     """
     digest = hashlib.sha256()
     for name, content in _contents(model):
@@ -397,12 +397,12 @@ def _contents(struct: Any, prefix: str = '') -> Iterator[tuple[str, bytes]]:
 
 
 def mjcf_attachment(path: Path) -> Attachment:
-    """Return the MJCF file at `path` as one text that contains the files it includes, no meshes."""
+    """Return the MJCF file at `path` and the files it includes as one text, without meshes."""
     text = mujoco.MjSpec.from_file(str(path)).to_xml()
     return Attachment('model.xml', 'application/xml', text.encode())
 
 
 def compiled_attachment(model: mujoco.MjModel) -> Attachment:
-    """Return the compiled model, compressed with zstd to 3 MB; this is slow."""
+    """Return the compiled model, compressed with zstd to 3 MB; call it once for all episodes."""
     data = zstandard.ZstdCompressor(level=10).compress(compiled_bytes(model))
     return Attachment('model.mjb.zst', 'application/zstd', data)

@@ -50,7 +50,7 @@ class Sensed:
 
 
 def sense(simulation: Simulation) -> Sensed:
-    """Read the sensors of all robots, once."""
+    """Read the sensors and goals of all robots and compute their rewards."""
     readings, truth = simulation.readings(), None
     if not simulation.disturbances.is_off:
         truth = simulation.true_readings()

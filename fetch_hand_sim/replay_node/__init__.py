@@ -1,8 +1,8 @@
 """`replay_node`: publishes a logged episode on its topics with its timing.
 
-Subscribers cannot distinguish it from a robot, so `policy_node` works with a replay, too. Recorded
-commands are published only on request, because they would mix with those of a policy. `schedule.py`
-computes what to publish when, without ROS; `node.py` is the node.
+It has the topics of a robot, so `policy_node` works with a replay, too. Recorded commands are
+published only on request, because they would mix with those of a policy. `schedule.py` computes
+what to publish when, without ROS; `node.py` is the node.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""`python -m fetch_hand_sim.replay_node`."""
+"""Run the node with `python -m fetch_hand_sim.replay_node`."""
 
 import sys
 

@@ -35,8 +35,9 @@ class ReplaySchedule:
 
     Args:
         path: The episode.
-        topics: Topics to publish; none selects all that the robot published.
-        with_inputs: Whether all topics include commands and goals that the robot received.
+        topics: Topics to publish; empty for all topics that the robot published.
+        with_inputs: Whether to publish also the commands and goals that the robot received, if
+            `topics` is empty.
 
     Attributes:
         start_ns: Log time of the first message of the episode, published or not.
@@ -120,7 +121,7 @@ class Playhead:
         return self._position_ns + int((now - self._since) * self.rate * 1e9)
 
     def remaining(self, time_ns: int, now: float) -> float:
-        """Return the seconds until a log time is due; infinity while paused."""
+        """Return the wall-clock seconds until a log time is reached; infinity while paused."""
         if not self.rate:
             return math.inf
         return (time_ns - self._position_ns) / 1e9 / self.rate - (now - self._since)

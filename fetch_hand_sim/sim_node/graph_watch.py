@@ -119,7 +119,7 @@ class GraphWatch:
         self._status = node.resolve_topic_name('episode_status')
 
     def update(self) -> None:
-        """Read the graph."""
+        """Read the ROS graph and renew all attributes."""
         found = [each for topic in self.inputs.types for each in self._found(topic)]
         if self.inputs.update(found, time.monotonic()):
             self.has_newcomer = True
@@ -135,7 +135,7 @@ class GraphWatch:
         return self._subscribers.are_connected()
 
     def waiting_elsewhere(self) -> list[str]:
-        """Return a line for each node that waits for the `episode_status` of a missing robot."""
+        """Return a line for each node that waits for a robot in another, empty namespace."""
         return [
             f'{full_name(info.node_namespace, info.node_name)} waits for a robot on {name}'
             for name, _ in self._node.get_topic_names_and_types()

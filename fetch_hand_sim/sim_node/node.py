@@ -225,7 +225,7 @@ class SimNode(Node):
             loop.wait(BEAT)
 
     def _serve_until_due(self, loop: EventLoop, stop: StopSignals) -> None:
-        """Run the tick if it is due, after waiting callbacks; otherwise serve one callback."""
+        """If a tick is due, serve waiting callbacks and run it; otherwise serve one callback."""
         remaining = self._robot.wait()
         if remaining > 0.0:
             loop.wait(min(remaining, BEAT))

@@ -1,4 +1,4 @@
-"""One simulated robot without ROS: ticks, services, goals and pushes."""
+"""Simulate one robot without ROS: ticks, service calls, goals and pushes."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ class Robot:
         self._late_commands = 0
 
     def wait(self) -> float:
-        """Return the seconds until the next tick; infinity if a command or service must come."""
+        """Return the seconds until the next tick; infinity while it waits for a command or call."""
         now = self._clock()
         has_command = self.buffer.has_fresh_command or not self.runner.has_started
         wait = self.schedule.wait(now, has_command, self.lacks_answer)
@@ -242,7 +242,7 @@ class Robot:
         return Answer(True, f'{"paused" if paused else "running"} at {self._now()}')
 
     def step(self, ticks: int = 1) -> Answer:
-        """Run several ticks immediately; fails in real time unless paused."""
+        """Run ticks immediately; in real time this fails unless the robot is paused."""
         if self.schedule.mode == 'realtime' and not self.schedule.is_paused:
             return Answer(False, 'a running simulation cannot be stepped; pause it first')
         if not 1 <= ticks <= MAX_STEPS:

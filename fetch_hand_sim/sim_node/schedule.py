@@ -69,7 +69,10 @@ class TickSchedule:
         return 1.0 / self.period if is_paced else None
 
     def wait(self, now: float, has_command: bool, lacks_answer: bool = False) -> float:
-        """Return the seconds until the next tick; infinity while paused or without a command."""
+        """Return the seconds until the next tick; infinity while paused.
+
+        In lockstep it is 0 with a new command (`has_command`), and infinity without one.
+        """
         if self.is_paused or (self.mode == 'lockstep' and not has_command):
             return math.inf
         if self.mode == 'lockstep':

@@ -87,7 +87,7 @@ class SimulationInterfaces:
         return _finish(response, OK, '')
 
     def set_simulation_state(self, request: Any, response: Any) -> Any:
-        """Pause or resume."""
+        """Pause or resume the simulation."""
         target = request.state.state
         if target not in (PLAYING, PAUSED):
             line = f'state {target} given; allowed: {PLAYING} (playing), {PAUSED} (paused)'
@@ -109,7 +109,7 @@ class SimulationInterfaces:
         return _answer(response, Answer(answer.success, f'{answer.message}; time goes on'))
 
     def step_simulation(self, request: Any, response: Any) -> Any:
-        """Run the given number of ticks while paused."""
+        """Run the requested number of ticks; fail unless the simulation is paused."""
         if not self._robot.schedule.is_paused:
             line = 'a simulation is stepped only while it is paused'
             return _finish(response, OPERATION_FAILED, line)

@@ -1,4 +1,4 @@
-"""`python -m fetch_hand_sim.view`."""
+"""Run the command with `python -m fetch_hand_sim.view`."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """The command line of `view`.
 
-Exit codes: 0 if the user ends it, 1 without a robot or port or if a node fails, 2 for bad usage or
-an unreadable file.
+Exit code 0: the user ended the program; 1: no robot or no free port was found, or a node failed;
+2: bad usage or an unreadable file.
 """
 
 from __future__ import annotations

@@ -97,8 +97,9 @@ def is_loopback(host: str) -> bool:
 class Guard:
     """Accepts or rejects requests to the page.
 
-    Without a token, the Host header must be a loopback address, not another name that resolves to
-    it. With a token, every request needs the token. Only the page itself may open a web socket.
+    Without a token, the Host header must be `localhost` or a loopback address, not another name
+    that resolves to it. With a token, every request needs the token. Only the page itself may open
+    a web socket.
 
     Args:
         token: Secret that visitors need; None if only this machine can connect.

@@ -123,7 +123,7 @@ class _Viewer(web_viewer.WebViewer):
     frame_rate: FrameRate
 
     def prepare_next_frame(self) -> bool:
-        """Wait for the next frame and begin it."""
+        """Wait until the next frame is due and begin it."""
         time.sleep(self.frame_rate.wait_time(time.monotonic(), _read_touch()))
         begun: bool = super().prepare_next_frame()
         return begun

@@ -92,7 +92,7 @@ class BodyDrag:
         return messages.PerturbSnapshot(data.xfrc_applied.ravel().copy(), _FORCES)
 
     def end(self) -> None:
-        """Release the body."""
+        """Release the body and remove the force on it."""
         self._viewer.perturb.active = self._viewer.perturb.select = 0
         self._viewer.data.xfrc_applied[:] = 0.0
 
@@ -100,7 +100,7 @@ class BodyDrag:
 def _body_under(
     model: mujoco.MjModel, data: mujoco.MjData, options: mujoco.MjvOption, ray: Ray
 ) -> tuple[int, Array]:
-    """Return the first body on a ray, without the ghost, and the point (3,) hit; -1 for none."""
+    """Return the first body that a ray hits, except the ghost, and the point (3,); -1 for none."""
     ghost = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY.value, GHOST)
     geom = np.full((1, 1), -1, dtype=np.int32)
     distance = mujoco.mj_ray(

@@ -22,7 +22,7 @@ _ON_THE_TABLE = ('FetchPush', 'FetchSlide')
 
 @dataclass(frozen=True, slots=True)
 class Handle:
-    """A point of a goal that the mouse can grab, with its drawn position (3,), m."""
+    """A point of a goal that the mouse can grab: its number and its drawn position (3,), m."""
 
     index: int
     position: Array
