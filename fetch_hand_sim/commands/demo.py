@@ -162,8 +162,9 @@ class Demo:
         """Run the nodes and return the exit code; print their output after a failure."""
         began = time.monotonic()
         with open_log('demo') as output:
+            policy_parameters = {'policy': policy, 'trust': self._options.trust}
             nodes = start_nodes(
-                {'policy_node': {'policy': policy}, 'sim_node': self._sim_parameters()}, output
+                {'policy_node': policy_parameters, 'sim_node': self._sim_parameters()}, output
             )
             try:
                 self._watch(watcher, nodes, stop)
@@ -279,8 +280,10 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     add(
         '--policy',
         default='',
-        help='a shipped actor, a file, random or resting; default: the shipped actor of the task',
+        help='a shipped actor, a file, module:function, random, resting or robust; default: the '
+        'shipped actor of the task',
     )
+    add('--trust', action='store_true', help='allow policies that run code of their own')
     options = parser.parse_args(arguments)
     try:
         task_spec(options.task)

@@ -31,9 +31,10 @@ def test_the_demo_logs_episodes_and_stops_in_order(
 ):
     # Which a parameter file would have as a number and a comment.
     directory = '20261125 #1'
-    options = ('--episodes', '100', f'--episode-dir=~/{directory}')
+    (tmp_path / 'mine.py').write_text('def make(task): return lambda observation: [0.0] * 4')
+    options = ('--episodes', '100', f'--episode-dir=~/{directory}', '--policy=mine:make', '--trust')
     environment = ros_environment | {'HOME': str(tmp_path)}
-    demo = start_process(*DEMO, *options, env=environment)
+    demo = start_process(*DEMO, *options, env=environment, cwd=tmp_path)
     header = 'episode seed steps return success file'
     assert demo.stdout.readline().split() == header.split()
     row = demo.stdout.readline().split()
