@@ -26,6 +26,7 @@ from node_runtime.command_line import (
     CommandError,
     CommandParser,
     UsageError,
+    complain,
     progress,
     run_command,
     say,
@@ -52,7 +53,7 @@ from policy_node.training.robustness.sweeps import Point, points, sentence
 
 _NAME = 'fetch_hand_sim robustness'
 # Settings that make the points of two results comparable.
-_SETTINGS = ('task', 'sha256', 'episodes', 'first_seed', 'control_hz')
+_SETTINGS = ('policy', 'task', 'sha256', 'episodes', 'first_seed', 'control_hz')
 
 
 def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
@@ -127,6 +128,8 @@ def _start(
             f'{file} is of another policy or has other settings ({", ".join(_SETTINGS)}); '
             'remove it or give another --output'
         )
+    # A function has no hash, so its code may have changed.
+    complain(_NAME, f'{file} has {len(earlier_points)} points; remove it to measure them again')
     return {**result, 'points': earlier_points}
 
 

@@ -53,7 +53,8 @@ def test_an_interrupted_command_goes_on_with_the_missing_points(tmp_path, capsys
     assert len((tmp_path / 'a.b.csv').read_text().splitlines()) == len(whole['points']) + 1
     assert (tmp_path / 'a.b.png').read_bytes()[:4] == b'\x89PNG'
     capsys.readouterr()
-    for arguments in ([*words, '--first-seed', '1'], [*words, '--episodes', '3']):
+    for other in (['--first-seed', '1'], ['--episodes', '3'], ['--policy', 'random']):
+        arguments = [*words, *other]
         assert main(arguments) == 2
         assert 'other settings' in capsys.readouterr().err
     file.write_text('[1]')
