@@ -43,7 +43,7 @@ class NetworkShape:
 
     @property
     def past_size(self) -> int:
-        """Total length of the past actions."""
+        """Number of past actions times the action size."""
         return self.past_actions * self.action_size
 
     @property

@@ -47,7 +47,7 @@ Count = Annotated[int, Range(0, 1024)]
 
 @dataclass(frozen=True, kw_only=True)
 class Start:
-    """Task, recipe, seed and algorithm of the run."""
+    """Settings of the run: task, recipe, seed and algorithm."""
 
     task: str
     """Task name, `FetchReach`, ..."""
@@ -62,7 +62,7 @@ class Start:
 
 @dataclass(frozen=True, kw_only=True)
 class Collect:
-    """Collection of episodes in the simulation."""
+    """Settings of the simulations that collect episodes."""
 
     num_envs: Annotated[int, Range(1, 100_000)] = 64
     """Simulations stepped together; each cycle collects one episode of each."""
@@ -79,7 +79,7 @@ class Collect:
 
 @dataclass(frozen=True, kw_only=True)
 class Goals:
-    """Rewards and hindsight goals."""
+    """Settings of rewards and hindsight goals."""
 
     reward_type: Literal['sparse', 'dense'] = 'sparse'
     """`sparse` (-1 until success, then 0) or `dense` (negative distance)."""
@@ -109,7 +109,7 @@ class Goals:
 
 @dataclass(frozen=True, kw_only=True)
 class Network:
-    """Networks of the actor and the critic."""
+    """Settings of the networks of actor and critic."""
 
     hidden_sizes: tuple[int, ...] = (256, 256, 256)
     """Width of each hidden layer of actor and critic."""
@@ -127,7 +127,7 @@ class Network:
 
 @dataclass(frozen=True, kw_only=True)
 class Replay:
-    """Replay of the collected episodes."""
+    """Settings of the replay and of the episodes to learn from."""
 
     replay_transitions: Annotated[int, Range(1)] = 1_000_000
     """Capacity of the replay."""
@@ -147,7 +147,7 @@ class Replay:
 
 @dataclass(frozen=True, kw_only=True)
 class Learner:
-    """Gradient updates of the networks."""
+    """Settings of the gradient updates."""
 
     batch_size: Annotated[int, Range(1, 1_000_000)] = 1024
     """Transitions per update."""
@@ -185,7 +185,7 @@ class Learner:
 
 @dataclass(frozen=True, kw_only=True)
 class Exploration:
-    """Exploration noise while episodes are collected."""
+    """Settings of the exploration noise."""
 
     random_epsilon: Share = 0.3
     """Probability of a uniformly random action."""
@@ -202,7 +202,7 @@ class Exploration:
 
 @dataclass(frozen=True, kw_only=True)
 class Critics:
-    """Number, normalisation and outputs of the critics."""
+    """Settings of the critics: number, normalisation and quantiles."""
 
     critics: Annotated[int, Range(1, 100)] = 1
     """Critics that start differently; the actor follows their mean."""
@@ -218,7 +218,7 @@ class Critics:
 
 @dataclass(frozen=True, kw_only=True)
 class Values:
-    """Returns and values that the critics learn."""
+    """Settings of the returns and values that the critics learn."""
 
     n_step: Annotated[int, Range(1, 100)] = 1
     """Most steps of a return before it bootstraps."""
@@ -247,7 +247,7 @@ class Values:
 
 @dataclass(frozen=True, kw_only=True)
 class Subgoals:
-    """Imagined subgoals, and subgoals of a second, high level."""
+    """Settings of subgoals, imagined or proposed by a second, high level."""
 
     subgoal_prior: Annotated[float, Range(0)] = 0.0
     """Weight in the actor loss of the distance between its actions and those for an imagined
@@ -262,7 +262,7 @@ class Subgoals:
 
 @dataclass(frozen=True, kw_only=True)
 class Ppo:
-    """Initial networks of proximal policy optimisation (PPO)."""
+    """Settings of the initial networks for proximal policy optimisation (PPO)."""
 
     first_value: Annotated[float, Range(-1_000_000, 0)] = 0.0
     """Value that the critic of `ppo` starts with. With -1 / (1 - gamma), the value of failing for
@@ -274,7 +274,7 @@ class Ppo:
 
 @dataclass(frozen=True, kw_only=True)
 class Imitation:
-    """Imitation of the policy in `init_from`, which observes the true state (DAgger)."""
+    """Settings of imitation (DAgger): the policy in `init_from` observes the true state."""
 
     value_weight: Annotated[float, Range(0, 1000)] = 0.0
     """Weight of the value that an action loses against the action of the imitated policy, by its
@@ -285,7 +285,7 @@ class Imitation:
 
 @dataclass(frozen=True, kw_only=True)
 class Limits:
-    """Length of the run, evaluations and checkpoints."""
+    """Settings of the length of the run, evaluations and checkpoints."""
 
     total_steps: Annotated[int, Range(1)] = 5_000_000
     """Environment steps of the run."""
@@ -303,7 +303,7 @@ class Limits:
 
 @dataclass(frozen=True, kw_only=True)
 class Machine:
-    """Threads, precision and device."""
+    """Settings of threads, precision and device."""
 
     overlap: bool = True
     """Collect with the actor of the previous cycle while learning; False alternates."""

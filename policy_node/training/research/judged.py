@@ -112,7 +112,7 @@ class CuttingSampler(TransitionSampler):
 
     Attributes:
         judge: The learner with the actor to compare with.
-        cut_distance: Largest root mean square distance of the two actions in a return.
+        cut_distance: Largest distance (root mean square) between the two actions in a return.
     """
 
     judge: DDPG

@@ -223,7 +223,7 @@ class _Board:
         self._write(step=resumed_steps + 1, session_log=start)
 
     def write(self, row: Row) -> None:
-        """Write the values of a cycle at its environment steps."""
+        """Write the values of a row to the event file, at the environment steps of the row."""
         values = [
             self._summary.Value(tag=name, simple_value=value)
             for name, value in row.items()

@@ -106,9 +106,9 @@ def _paper_settings(task: str) -> dict[str, Any]:
 
     Fetch tasks have 1.2 % (FetchReach) or 32 % of the paper's steps and smaller batches. One
     collection of 76 episodes replaces two of 38, with twice the updates. Targets move every 10
-    updates instead of 40, because there are so few. Hand tasks use the recipe `best`, which learns
-    in a million steps what the paper's recipe learns in many. Long runs compute in bfloat16, except
-    those of hand tasks that began on a processor without it.
+    updates instead of 40, because a run has few updates. Hand tasks use the recipe `best`, which
+    learns in a million steps what the paper's recipe learns in many millions. Long runs compute in
+    bfloat16, except those of hand tasks that began on a processor without it.
     """
     if not task.startswith('Fetch'):
         return HAND if task in _IN_BFLOAT16 else {**HAND, 'precision': 'float32'}

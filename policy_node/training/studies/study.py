@@ -195,7 +195,7 @@ class Job:
 
     @property
     def key(self) -> tuple[str, str, int]:
-        """Task, variant and seed."""
+        """Task, variant and seed, which identify the job."""
         return self.config.task, self.arm.name, self.config.seed
 
     @property
