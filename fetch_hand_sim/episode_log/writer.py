@@ -53,7 +53,7 @@ class ReceivedAllowance:
         """Count a received message of `size` bytes; return whether to log it.
 
         Messages that the robot rejected (`is_refused`) may use at most half of the limit, so that
-        there is room for valid messages. `omitted` lists them as `<topic> (refused)`.
+        room remains for valid messages. `omitted` lists them as `<topic> (refused)`.
         """
         share = 2 if is_refused else 1
         if (
