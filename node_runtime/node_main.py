@@ -266,3 +266,6 @@ def _reject_arguments(args: Sequence[str]) -> None:
             )
         elif before in ('-p', '--param') and arg.partition(':=')[1:] == (':=', ''):
             raise UsageError(f'{arg} has no value; an empty text is given as {arg}"\'\'"')
+        elif '__ns:=/' in arg and arg.endswith('/') and not arg.endswith('=/'):
+            # rcl accepts such a name, and the node then fails with a wrong reason.
+            raise UsageError(f'the namespace in {arg} ends with /; use {arg[:-1]}')
