@@ -109,7 +109,7 @@ def _explain(words: Sequence[str]) -> int:
 
 
 def _split(words: Sequence[str]) -> tuple[Command | None, list[str], list[str]]:
-    """Split arguments into a subcommand (or None), the words that name it, and its arguments."""
+    """Return the subcommand or None, the words of its name, and the arguments after them."""
     commands, command, path = COMMANDS, None, []
     for word in words:
         if word not in commands:

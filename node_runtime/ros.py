@@ -45,7 +45,7 @@ def seldom(seconds: float) -> dict[str, Any]:
 
 @cache
 def _steady_clock() -> Clock:
-    """Return the same clock at each call, because loggers reject a second clock for a line."""
+    """Return a clock, always the same: a log call may not change the clock that limits its rate."""
     from rclpy.clock import Clock
     from rclpy.clock_type import ClockType
 

@@ -312,7 +312,7 @@ class _Received:
         self._lacks_commands = is_recovered or bool(_COMMANDS & outcome.received_not_logged.keys())
 
     def differences(self, number: int, command: Array) -> Iterator[tuple[str, object, object]]:
-        """Yield a difference if `command` of tick `number` is not the last valid one received."""
+        """Yield field, logged and expected value if another command was received last."""
         if not number:
             self._commands.start_episode(self._runner.resting_command())
         if not self._lacks_commands and self._commands.has_fresh_command:

@@ -261,7 +261,7 @@ class RobotEnv(FetchHandEnv, GoalEnv):
         self._state(**{name: state[name] for name in state['_stated']})
 
     def _render_callback(self) -> None:
-        """Show the goal in `model` and `data` if the user has read one of them."""
+        """Write the goal into `model` and `data`, if the user has read one of them."""
         if self._physics.is_shared:
             self._show_goal()
             self._keep_goal()

@@ -205,7 +205,7 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
         return np.asarray(self.compute_reward(*_evaluated(result)), dtype=np.float64)
 
     def _endings(self, name: str, result: StepResult) -> Flags:
-        """Return flags (N,) of the episodes that the method `name`, if overridden, ends."""
+        """Return which episodes the method `name` ends, (N,); none if it is not overridden."""
         if not self.overrides(name):
             return np.zeros(self.num_envs, dtype=bool)
         ends = getattr(self, name)(*_evaluated(result))

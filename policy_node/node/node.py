@@ -166,7 +166,7 @@ class PolicyNode(Node):
         return before is not None and now is not None and not now.is_of_same_robot(before)
 
     def _take_policy(self, parameters: list[Parameter]) -> SetParametersResult:
-        """Load a new `policy` while the parameter is set, so that the request reports errors."""
+        """Load a new `policy` before its parameter changes; a failure rejects the request."""
         result = set_callback(POLICY_NODE)(parameters)
         for parameter in parameters:
             if parameter.name != 'policy' or not result.successful:

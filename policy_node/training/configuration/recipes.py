@@ -40,7 +40,8 @@ def recipe_config(task: str, recipe: str, **overrides: Any) -> TrainConfig:
     Args:
         recipe: `paper` (Plappert et al. 2018, appendix B), `best` (the best measured here from
             random networks), `robust` (imitation of the shipped policy on a disturbed robot) or
-            `finetune` (continues from a shipped policy with an object in the hand).
+            `finetune` (continues from the shipped policy of FetchSlide or of a task with an object
+            in the hand).
         **overrides: Fields of `TrainConfig` that replace those of the recipe.
 
     Raises:
@@ -160,6 +161,19 @@ _HAND_REACH = {
     'total_steps': 2_000_000,
     'replay_transitions': 2_000_000,
 }
+# Smaller steps, less noise and more updates after `_SLIDE`, so that the puck stops at the goal.
+_SLIDE_FINETUNE = _SLIDE | {
+    'learning_starts': 150_000,
+    'critic_first': 2_000,
+    'learning_rate': 3e-4,
+    'final_learning_rate': 0.05,
+    'noise_std': 0.06,
+    'random_epsilon': 0.06,
+    'final_exploration': 0.25,
+    'updates_per_cycle': 160,
+    'total_steps': 1_200_000,
+    'evaluate_every': 150_000,
+}
 _BEST: dict[str, dict[str, Any]] = {
     'FetchReach': _REACH,
     'FetchPush': _PUSH,
@@ -233,14 +247,18 @@ def _object_in_hand(task: str) -> dict[str, Any]:
 def _finetune(task: str) -> dict[str, Any]:
     """Return the fields of the recipe `finetune`: a shipped policy learns to hold reached goals.
 
-    Three settings keep the critic from overestimating values: goals that do not depend on outcomes,
-    a short horizon and rare updates of the actor (docs/lab_notes/training_log.md).
+    With an object in the hand, three settings keep the critic from overestimating values: goals
+    that do not depend on outcomes, a short horizon and rare updates of the actor
+    (docs/lab_notes/training_log.md).
 
     Raises:
-        ValueError: If the task has no object in the hand.
+        ValueError: If the task is neither FetchSlide nor has an object in the hand.
     """
+    if task == 'FetchSlide':
+        return _SLIDE_FINETUNE | {'init_from': task}
     if not task.startswith('HandManipulate'):
-        raise ValueError(f'recipe finetune is for the tasks with an object in the hand, not {task}')
+        allowed = 'FetchSlide and the tasks with an object in the hand'
+        raise ValueError(f'recipe finetune for {task}; allowed: {allowed}')
     values = _best(task) | {
         'init_from': task,
         'goals': 'actual=.2,displaced=.4',

@@ -190,7 +190,7 @@ class HierarchicalTransitions(Transitions):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SubgoalSampler(TransitionSampler):
-    """Draws transitions of the high level, each over the `most_steps` ticks of a subgoal."""
+    """Draws transitions of the high level, each over the `subgoal_every` ticks of a subgoal."""
 
     missed_value: float
 

@@ -67,7 +67,16 @@ BEST = Study(
     None,
     'What does each recipe reach?',
     {task: _OVERLAPPING for task in _ORDER},
-    (Arm('best', 'DDPG+HER, best recipe'),),
+    (
+        Arm('best', 'DDPG+HER, best recipe'),
+        Arm(
+            'finetuned',
+            'then recipe finetune',
+            {'recipe': 'finetune'},
+            after='best',
+            tasks=('FetchSlide',),
+        ),
+    ),
     seeds=1,
     starts={task: _start(task) for task in _STARTS_FROM},
     ships=True,

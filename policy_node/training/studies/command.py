@@ -5,8 +5,8 @@
 data, figure and table in docs/research/NAME. Runs that the folder contains are not trained again.
 
 `--study best`: the best recipe of every task, one job per core. Some tasks start from the networks
-of another. Finally evaluates each best actor on fresh episodes and copies it with its critic,
-evaluation and curve into <output>/actors.
+of another, and FetchSlide is then fine-tuned (recipe `finetune`). Finally evaluates each best actor
+on fresh episodes and copies it with its critic, evaluation and curve into <output>/actors.
 
 `--study module:NAME`: a `Study` of your own in a Python module of the working directory.
 
@@ -228,7 +228,7 @@ def _not_stored(jobs: Sequence[Job], folder: Path) -> list[Job]:
 def _place(
     options: argparse.Namespace, report: Path, command: str
 ) -> contextlib.AbstractContextManager[Place]:
-    """Return where the jobs run: this process, several processes or Ray."""
+    """Return the runner of the jobs that the options choose: this process, others or Ray."""
     cores = len(os.sched_getaffinity(0))
     limit = options.jobs or (cores if options.study.ships else 1)
     if options.ray:

@@ -51,11 +51,11 @@ class Band:
 def write_study(study: Study, output: Path) -> None:
     """Write the tables and the figure of a study from the runs in its folder.
 
-    `arms.csv` holds medians and quartiles. Text of the user around the table in `README.md` stays.
+    `arms.csv` holds medians and quartiles. `README.md` keeps what the user wrote around its table.
 
     Raises:
         ValueError: If a stored run cannot be read.
-        OSError: If the report cannot be written; the earlier one stays.
+        OSError: If a file cannot be written; the files of the earlier report stay.
     """
     with alone_in(output):
         runs = in_order(read_runs(output).values(), study)

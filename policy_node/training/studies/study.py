@@ -58,12 +58,17 @@ class Arm:
         label: Name in figures and tables.
         changes: Fields of `TrainConfig` that only this variant sets.
         factors: Integer fields, and the factor by which this variant multiplies their common value.
+        after: Variant whose run of the same task and seed trains the networks that this one starts
+            from; empty for random ones.
+        tasks: Tasks of this variant; empty for all tasks of the study.
     """
 
     name: str
     label: str
     changes: Mapping[str, Any] = field(default_factory=dict)
     factors: Mapping[str, int] = field(default_factory=dict)
+    after: str = ''
+    tasks: tuple[str, ...] = ()
 
     @property
     def own(self) -> set[str]:
@@ -158,9 +163,12 @@ class Study:
                 raise ValueError(f'--tasks {task}; allowed in {self.name}: {", ".join(self.tasks)}')
         jobs: dict[tuple[str, str, int], Job] = {}
         for task in (name for name in self.tasks if name in tasks):
-            start = self.starts.get(task)
-            for seed, arm in product(seeds, arms):
-                before = jobs.get((start.task, arm.name, seed)) if start else None
+            of_task = [arm for arm in arms if not arm.tasks or task in arm.tasks]
+            for seed, arm in product(seeds, of_task):
+                start = Start(task, {}) if arm.after else self.starts.get(task)
+                before = jobs.get((start.task, arm.after or arm.name, seed)) if start else None
+                if arm.after and before is None:
+                    raise ValueError(f'--arms {arm.name} also needs {arm.after}, where it starts')
                 given = (
                     {**start.fields, 'init_from': str(before.folder)} if start and before else {}
                 )

@@ -198,8 +198,8 @@ TINY += options_of(replay_transitions=4000, learning_starts=0)
 EGGS = ['HandManipulateEggRotate', 'HandManipulateEggFull']
 
 
-def jobs_of(*arguments: str) -> list[Job]:
-    return jobs_from_arguments(parse_arguments(['--study', 'best', *arguments]))
+def jobs_of(*arguments: str, arms: tuple[str, ...] = ('best',)) -> list[Job]:
+    return jobs_from_arguments(parse_arguments(['--study', 'best', *arguments, '--arms', *arms]))
 
 
 def test_every_task_is_trained_with_its_best_recipe_after_what_it_starts_from(
@@ -221,6 +221,18 @@ def test_every_task_is_trained_with_its_best_recipe_after_what_it_starts_from(
             assert job.after in jobs[:number] and job.after.config.task == start.task
     (alone,) = jobs_of('--tasks', EGGS[1], '--output', str(tmp_path))
     assert alone.after is None and alone.config.init_from == ''
+
+
+def test_a_variant_that_continues_another_follows_it_and_is_not_possible_without_it(
+    tmp_path: Path,
+) -> None:
+    tasks = ['--tasks', 'FetchReach', 'FetchSlide', '--output', str(tmp_path)]
+    slide, finetuned, reach = jobs_of(*tasks, arms=('best', 'finetuned'))
+    assert reach.config.task == 'FetchReach' and finetuned.after is slide
+    assert finetuned.config.recipe == 'finetune'
+    assert finetuned.config.init_from == str(slide.folder)
+    with pytest.raises(ValueError, match='finetuned also needs best'):
+        jobs_of(*tasks, arms=('finetuned',))
 
 
 def test_the_status_of_a_job_says_how_far_it_is_and_how_long_it_will_take(tmp_path: Path) -> None:
