@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from typing import Literal
@@ -34,6 +35,8 @@ INTERFACE_VERSION = 2
 # Size of the cache of topics. Each joint prefix makes another task, so a limit is needed.
 _TASKS = 256
 WORLD = 'world'
+# A namespace without the slashes around it, or the name of a node.
+NAMESPACE = re.compile(r'(?:[A-Za-z_]\w*(?:/[A-Za-z_]\w*)*)?', re.ASCII)
 
 _POSITION = VectorPart('position', 3, 'm')
 _QUATERNION = VectorPart('orientation', 4, 'quaternion')

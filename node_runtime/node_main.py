@@ -6,6 +6,7 @@ import ctypes
 import math
 import os
 import pkgutil
+import re
 import signal
 import struct
 import sys
@@ -19,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 from msgs_spec.parameters import usage
 from msgs_spec.text import one_line
+from msgs_spec.topics import NAMESPACE
 from node_runtime.command_line import (
     EXIT_FAILURE,
     EXIT_SUCCESS,
@@ -266,6 +268,10 @@ def _reject_arguments(args: Sequence[str]) -> None:
             )
         elif before in ('-p', '--param') and arg.partition(':=')[1:] == (':=', ''):
             raise UsageError(f'{arg} has no value; an empty text is given as {arg}"\'\'"')
-        elif '__ns:=/' in arg and arg.endswith('/') and not arg.endswith('=/'):
-            # rcl accepts such a name, and the node then fails with a wrong reason.
-            raise UsageError(f'the namespace in {arg} ends with /; use {arg[:-1]}')
+        elif re.search('__(ns|node):=', arg) and not NAMESPACE.fullmatch(
+            arg.partition(':=')[2].removeprefix('/')
+        ):
+            raise UsageError(
+                f'{arg[:80]!r} given; allowed: letters, digits and _, as a namespace also several '
+                'such names with / between, none of which begins with a digit'
+            )

@@ -13,10 +13,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from msgs_spec.tasks import TASKS
+from msgs_spec.topics import NAMESPACE
 from node_runtime.command_line import CommandParser, require_extra, run_command
 
 _LOOPBACK = '127.0.0.1'
-_NAMESPACE = re.compile(r'(?:[A-Za-z_]\w*(?:/[A-Za-z_]\w*)*)?', re.ASCII)
 # ROS allows 245, including the names of topics and services.
 _LONGEST_NAMESPACE = 150
 _DESCRIPTION = (
@@ -40,7 +40,7 @@ def _namespace(text: str) -> str:
 
 
 def _is_namespace(text: str) -> bool:
-    return len(text) <= _LONGEST_NAMESPACE and _NAMESPACE.fullmatch(text) is not None
+    return len(text) <= _LONGEST_NAMESPACE and NAMESPACE.fullmatch(text) is not None
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:

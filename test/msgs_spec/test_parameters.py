@@ -148,7 +148,8 @@ def test_new_values_are_checked_while_the_node_runs(make_node):
         (['task:=FetchPush'], "unknown argument 'task:=FetchPush'; parameters are given"),
         (['--ros-args', '-p', 'task:=FetchPush', '--', 'x'], "unknown argument 'x'; "),
         (['--ros-args', '-p', 'policy:=a:=', '-p', 'task:='], 'task:= has no value; '),
-        (['--ros-args', '-r', '__ns:=/a/'], 'the namespace in __ns:=/a/ ends with /; use __ns:=/a'),
+        (['--ros-args', '-r', '__ns:=/a/'], "'__ns:=/a/' given; allowed: letters, digits and _"),
+        (['--ros-args', '-r', '__node:=my-arm'], "'__node:=my-arm' given; allowed: letters, "),
     ],
 )
 def test_arguments_that_rclpy_ignores_are_rejected(arguments, line):
