@@ -1,4 +1,4 @@
-"""List the episodes in a folder as a table.
+"""List an episode, or the episodes in a folder, as a table.
 
 Exit code 0: all episodes were read; 1: an episode was skipped (stderr names it); 2: bad usage.
 """
@@ -21,7 +21,7 @@ from fetch_hand_sim.episode_log import (
     EpisodeLogError,
     EpisodeReadError,
     EpisodeSummary,
-    find_episodes,
+    expand_episodes,
     find_leftovers,
     read_summary,
 )
@@ -101,7 +101,7 @@ def _shown(cell: str) -> str:
 
 def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = CommandParser(prog=_NAME, description=__doc__)
-    parser.add_argument('directory', type=Path, help='folder of episodes')
+    parser.add_argument('path', type=Path, help='an episode, or a folder of episodes')
     add_filter_options(parser)
     parser.add_argument('--json', action='store_true', help='print a JSON array instead of a table')
     return parser.parse_args(arguments)
@@ -116,8 +116,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _run(options: argparse.Namespace) -> int:
     errors: list[EpisodeReadError] = []
     with usage_errors((EpisodeReadError, EpisodeLogError)):
-        episodes = list(read_each(find_episodes(options.directory), read_summary, errors.append))
-        leftovers = find_leftovers(options.directory)
+        episodes = list(read_each(expand_episodes(options.path), read_summary, errors.append))
+        leftovers = find_leftovers(options.path) if options.path.is_dir() else []
     shown = [each for each in episodes if is_wanted(options, each.metadata.get('task'), each)]
     if options.json:
         print(json.dumps([_as_json(episode) for episode in shown], indent=2))
@@ -126,7 +126,7 @@ def _run(options: argparse.Namespace) -> int:
         successes = sum(episode.outcome.is_success is True for episode in shown)
         filtered = len(episodes) - len(shown)
         print(f'{len(shown)} episodes, {successes} successes; {filtered} filtered')
-        if not (episodes or errors) and (below := folders_below(options.directory)):
+        if not (episodes or errors) and (below := folders_below(options.path)):
             print(f'episodes are in {below}')
     for leftover in leftovers:
         remedy = '' if leftover.problem else '; complete it with fetch_hand_sim episodes recover'

@@ -173,7 +173,7 @@ def test_help_loads_no_large_library():
         ('benchmark', '--seeds 0,1', "'0,1' given; allowed: whole numbers from 0"),
         ('episodes generate', '--first-seed 9223372036854775808', 'numbers 0 ... 4294967295'),
         ('episodes generate', '', 'the following arguments are required: --output'),
-        ('episodes list', '--nosuch', 'the following arguments are required: directory'),
+        ('episodes list', '--nosuch', 'the following arguments are required: path'),
         ('train', '--set seed=1 gamma=.9', 'a --set of its own: --set gamma=.9'),
         ('train', '--nosuch \x1b[31m', 'unrecognized arguments: --nosuch \\x1b[31m'),
     ],

@@ -23,6 +23,7 @@ from fetch_hand_sim.episode_log import (
     read_summary,
     recover_episode,
 )
+from fetch_hand_sim.episode_log.files import mcap_file
 from fetch_hand_sim.episode_log.metadata import parse_task
 from fetch_hand_sim.episode_log.reader import split_ticks
 from fetch_hand_sim.episodes.checker import check_episode
@@ -294,6 +295,19 @@ def test_list_shows_the_metadata_of_the_files(reach, capsys):
         assert float(words[4]) == float(summary.result['return'])
         assert words[5:7] == ['no', '2.00'] and words[8] == 'complete'
     assert lines[-1] == '3 episodes, 0 successes; 0 filtered'
+
+
+def test_list_takes_one_file_or_bag_like_the_other_commands(reach, tmp_path, capsys):
+    bag = min(reach.iterdir())
+    for path in (bag, mcap_file(bag)):
+        assert episodes_list.main([str(path)]) == 0
+        lines = capsys.readouterr().out.splitlines()
+        assert lines[1].split()[0] == bag.name
+        assert lines[-1] == '1 episodes, 0 successes; 0 filtered'
+    # A bag of another storage is no empty folder of episodes.
+    (tmp_path / 'metadata.yaml').touch()
+    assert episodes_list.main([str(tmp_path)]) == 1
+    assert f'skipped {tmp_path} holds 0 MCAP files' in capsys.readouterr().err
 
 
 def test_list_calls_episodes_as_their_folders_and_names_those_below(reach, tmp_path, capsys):
