@@ -257,12 +257,12 @@ class SharedPhysics:
 
     @property
     def is_shared(self) -> bool:
-        """True once `model` or `data` was read."""
+        """True once the user has read `model` or `data` and may change or draw them."""
         return self._shares_model or self.shares_data
 
     @property
     def shares_data(self) -> bool:
-        """True once `data` was read."""
+        """True once the user has read `data` and may change or draw it."""
         return self._data is not None
 
     def move_sites(self, sites: list[int], positions: Array) -> None:
