@@ -93,7 +93,7 @@ def answer_label(stamp: int) -> str:
 
 
 def answered_stamp(message: Any) -> int | None:
-    """Return the stamp (ns) of the answered observation; None if the command does not name it."""
+    """Return the stamp (ns) of the observation that a command names; None if it names none."""
     for dimension in message.layout.dim[1:2]:
         if found := _ANSWER_LABEL.fullmatch(dimension.label):
             return int(found[1])

@@ -62,7 +62,7 @@ class Kind:
         return (numbers[0], numbers[-1]) if self.is_range else numbers[0]
 
     def scaled(self, value: Any, strength: float) -> Any:
-        """Return the value of a disturbance `strength` times as strong, within the limits."""
+        """Return `value` made `strength` times as strong, between `lowest` and `highest`."""
         if isinstance(value, tuple):
             return tuple(self.scaled(each, strength) for each in value)
         change = strength * (value - self.off)

@@ -111,7 +111,10 @@ class CheckResult:
 
 @lru_cache(maxsize=1)
 def _reference(task: str, **rules: Any) -> tuple[Simulation, RecordingContext, str]:
-    """Return a simulation, its recording context and the model hash that version 1.0 recorded.
+    """Return what an episode is compared with: simulation, recording context and model hash.
+
+    The hash is computed as version 1.0 of this package did, for episodes recorded by it. `rules`
+    are arguments of `Simulation`.
 
     The last result is cached, because most episodes of a folder have the same settings.
     """

@@ -204,7 +204,7 @@ class Robot:
     def reset(self, *, to_first_episode: bool = False) -> Answer:
         """End the running episode; the next tick starts the next one, or the first one again.
 
-        A robot that stands still runs this tick without a command.
+        A paused robot, or one that waits for commands, runs that next tick without a command.
         """
         runner = self.runner
         episode, was_running = runner.episode, not runner.is_between_episodes

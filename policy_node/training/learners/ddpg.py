@@ -95,11 +95,12 @@ class CriticLoss:
 class DDPG(ActorCritic):
     """Learner of deep deterministic policy gradient.
 
-    With `target=none`, the target networks are the networks themselves.
+    With `target=none` in the configuration, the target networks are the networks themselves.
 
     Args:
         workers: Processes that train together; gradients are averaged over them.
-        critic_loss: Creates the critic and computes its loss; None uses `CriticLoss`, as the paper.
+        critic_loss: Creates the critic and computes its loss. None uses `CriticLoss`, that of the
+            paper.
     """
 
     def __init__(

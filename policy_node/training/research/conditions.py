@@ -84,7 +84,10 @@ class ThresholdSampler(TransitionSampler):
         goal: Array32,
         generator: np.random.Generator,
     ) -> ConditionedTransitions:
-        """Return transitions whose condition is the logarithm of the drawn multiple."""
+        """Return transitions, each with a drawn multiple of the success thresholds.
+
+        The networks get the logarithm of the multiple as a further input, the condition.
+        """
         low, high = np.log(SMALLEST_THRESHOLD), np.log(self.widest)
         drawn = np.exp(generator.uniform(low, high, len(starts.row)))
         spec = self.metric.spec

@@ -141,7 +141,8 @@ class InitialNetworks:
     def _with_critics(self, critics: int) -> InitialNetworks:
         """Return a copy for a run with `critics` critics, whose tensors are named as in that run.
 
-        Surplus critics are left out, and all if `critics` is 0. `completed` adds missing ones.
+        Surplus critics are left out; with `critics` 0 none is kept. The copy may contain fewer than
+        `critics`: `completed` adds them.
         """
         tensors = {n: v for n, v in self.tensors.items() if not n.startswith(_PREFIXES)}
         if not critics:
