@@ -268,7 +268,7 @@ def _reject_arguments(args: Sequence[str]) -> None:
             )
         elif before in ('-p', '--param') and arg.partition(':=')[1:] == (':=', ''):
             raise UsageError(f'{arg} has no value; an empty text is given as {arg}"\'\'"')
-        elif re.search('__(ns|node):=', arg) and not NAMESPACE.fullmatch(
+        elif re.match('(.*:)?__(ns|node):=', arg) and not NAMESPACE.fullmatch(
             arg.partition(':=')[2].removeprefix('/')
         ):
             raise UsageError(

@@ -352,8 +352,8 @@ class TrainConfig(
         for name, each in FIELDS.items():
             each.require(getattr(self, name))
         # A file may change, or be missing where the run is resumed.
-        text = read_disturbances(self.disturbances).to_json()
-        object.__setattr__(self, 'disturbances', '' if text == '{}' else text)
+        given = read_disturbances(self.disturbances)
+        object.__setattr__(self, 'disturbances', '' if given.is_off else given.to_json())
         for is_broken, reason in _rules(self, task_spec(self.task, control_hz=self.control_hz)):
             if is_broken:
                 raise ValueError(reason)

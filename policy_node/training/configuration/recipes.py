@@ -161,7 +161,7 @@ _HAND_REACH = {
     'total_steps': 2_000_000,
     'replay_transitions': 2_000_000,
 }
-# Smaller steps, less noise and more updates after `_SLIDE`, so that the puck stops at the goal.
+# A smaller learning rate, less noise and more updates after `_SLIDE`.
 _SLIDE_FINETUNE = _SLIDE | {
     'learning_starts': 150_000,
     'critic_first': 2_000,
