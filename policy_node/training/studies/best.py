@@ -74,7 +74,7 @@ BEST = Study(
             'then recipe finetune',
             {'recipe': 'finetune'},
             after='best',
-            tasks=('FetchSlide',),
+            tasks=('FetchSlide', 'HandManipulateEggRotate'),
         ),
     ),
     seeds=1,
