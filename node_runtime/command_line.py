@@ -196,14 +196,18 @@ def _exit_code(name: str, run: Callable[[], int]) -> int:
 def _unclaimed_signals() -> list[signal.Signals]:
     """Return the signals that a command handles; none if the program handles SIGINT itself.
 
-    Shells start background processes with SIGINT ignored; these still handle the other signals.
+    A process that ignores SIGINT still handles the other signals.
     """
-    ignores_interrupt = signal.getsignal(signal.SIGINT) == signal.SIG_IGN
-    if not (has_default_interrupt() or ignores_interrupt):
+    if not (has_default_interrupt() or _ignores_interrupt()):
         return []
     others = (signal.SIGTERM, signal.SIGHUP)
     found = [each for each in others if signal.getsignal(each) == signal.SIG_DFL]
-    return found if ignores_interrupt else [signal.SIGINT, *found]
+    return found if _ignores_interrupt() else [signal.SIGINT, *found]
+
+
+def _ignores_interrupt() -> bool:
+    """Return whether SIGINT is ignored, as in the background processes of a shell script."""
+    return signal.getsignal(signal.SIGINT) == signal.SIG_IGN
 
 
 def make_output_usable() -> None:
@@ -211,7 +215,7 @@ def make_output_usable() -> None:
 
     Programs that handle SIGINT themselves keep their streams.
     """
-    if not has_default_interrupt():
+    if not (has_default_interrupt() or _ignores_interrupt()):
         return
     for name in ('stdout', 'stderr'):
         stream = getattr(sys, name)

@@ -23,8 +23,8 @@ from msgs_spec.text import entries
 Ids = NDArray[np.intp]
 # Ticks whose random numbers are drawn at once.
 _BLOCK = 64
-# Tracking that is lost comes back after half a second.
-_LOST_TICKS = 12
+# Seconds after which lost tracking comes back.
+_LOST_SECONDS = 0.5
 _PHYSICS = [each.name for each in fields(PhysicsDisturbance)]
 # Group and field of each range from which an episode draws once.
 _SPANS = {
@@ -326,7 +326,8 @@ class Disturber:
         tracked = self.disturbances.object
         if not is_first:
             self._lost = np.maximum(self._lost - 1, 0)
-            self._lost[(self._chance(3) < tracked.lost) & (self._lost == 0)] = _LOST_TICKS
+            lost_ticks = round(_LOST_SECONDS / self._task.tick_duration)
+            self._lost[(self._chance(3) < tracked.lost) & (self._lost == 0)] = lost_ticks
         is_fresh = self._tick % np.maximum(self.variations['object_period'], 1) == 0
         is_fresh &= (self._chance(4) >= tracked.stale) & (self._lost == 0)
         fresh = ids if is_first else ids[is_fresh[ids]]

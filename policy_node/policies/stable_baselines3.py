@@ -133,7 +133,8 @@ def _algorithm(data: bytes, path: Path) -> Any:
     """Return the algorithm class that matches the policy class named in a model file."""
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as file:
-            module = json.loads(file.read('data'))['policy_class']['__module__']
+            settings = json.loads(file.read('data'))
+        module = settings['policy_class']['__module__']
     except Exception as error:
         # Each compression method raises its own types for a damaged file.
         line = one_line(error)
@@ -141,6 +142,9 @@ def _algorithm(data: bytes, path: Path) -> Any:
     for package, name in _ALGORITHMS.items():
         if str(module).startswith(f'{package}.'):
             library = package.partition('.')[0]
+            if name == 'PPO' and 'clip_range' not in settings:
+                # PPO and A2C have the same policy class.
+                name = 'A2C'
             try:
                 return getattr(import_module(library), name)
             except ImportError:

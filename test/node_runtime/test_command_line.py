@@ -134,10 +134,15 @@ def test_help_on_a_full_or_closed_output_ends_as_every_command(words):
         assert said in process.stderr and process.stderr.count('\n') == bool(said)
 
 
+@pytest.mark.parametrize('interrupt', [signal.SIG_DFL, signal.SIG_IGN])
 @pytest.mark.parametrize('closed', [1, 2])
-def test_a_command_without_stdout_or_stderr_does_its_work(closed, tmp_path):
+def test_a_command_without_stdout_or_stderr_does_its_work(closed, interrupt, tmp_path):
+    def prepare():
+        os.close(closed)
+        signal.signal(signal.SIGINT, interrupt)
+
     body = f'with progress("x", 1): print(1); print(2, file=sys.stderr)\nopen("{tmp_path}/x", "w")'
-    process = run_script(f'{body}\nreturn 3', preexec_fn=lambda: os.close(closed))
+    process = run_script(f'{body}\nreturn 3', preexec_fn=prepare)
     process.communicate(timeout=20)
     assert process.returncode == 3 and (tmp_path / 'x').exists()
 

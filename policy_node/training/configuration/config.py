@@ -454,7 +454,8 @@ DEFAULTS = {name: each.default for name, each in FIELDS.items() if name != 'task
 NEEDS: tuple[tuple[str, str, Callable[[Any], bool]], ...] = (
     (
         'subgoal_every polyak target_update_interval policy_delay target discount critics '
-        'aggregate norm quantiles random_epsilon final_exploration noise_seconds',
+        'aggregate norm quantiles random_epsilon final_exploration noise_seconds '
+        'first_distance first_rotation',
         'algorithm ddpg',
         lambda c: c.algorithm == 'ddpg',
     ),

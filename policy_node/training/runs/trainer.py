@@ -205,7 +205,6 @@ class Trainer(BaseTrainer):
                 tensors = init_from.completed(self.learner)
                 load_networks(tensors, self.modules())
             self._let_critic_learn_first()
-        self._part_noise()
         self._steps_to_refill = 0
 
     def modules(self) -> dict[str, nn.Module]:
@@ -224,13 +223,6 @@ class Trainer(BaseTrainer):
         self.collector = make_collector(self.simulation, starts, config)
         return np.random.default_rng(sampler_seed)
 
-    def _part_noise(self) -> None:
-        """Seed torch differently on each worker, so that equal networks get different noise."""
-        rank = self.workers.rank
-        if rank > 0:
-            seeds = np.random.SeedSequence([self.config.seed, rank, self.counters.env_steps])
-            torch.manual_seed(int(seeds.generate_state(1)[0]))
-
     def resume(self, path: Path) -> None:
         """Continue from the training state in the file `path` and the replay beside it.
 
@@ -245,7 +237,6 @@ class Trainer(BaseTrainer):
         # The new configuration may evaluate more often.
         soonest = counters.env_steps + self.config.evaluate_every
         counters.next_evaluation = min(counters.next_evaluation, soonest)
-        self._part_noise()
         self.experience.narrow(self._progress())
         origin = state.extra.get('init_from', {})
         self._folder.init_from = origin

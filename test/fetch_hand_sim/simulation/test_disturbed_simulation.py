@@ -118,6 +118,25 @@ def test_a_stale_pose_is_repeated_while_pushes_move_the_object() -> None:
     assert 0.4 < moved.mean() < 0.9
 
 
+@pytest.mark.parametrize('control_hz', [25.0, 100.0])
+def test_lost_tracking_returns_after_half_a_second(control_hz: float) -> None:
+    disturbances = {'object': {'noise': 0.01, 'lost': 0.02}}
+    simulation = Simulation('FetchPush', 20, control_hz=control_hz, disturbances=disturbances)
+    simulation.reset(seed=0)
+    repeated, lengths = np.zeros(20, np.int64), []
+    seen = simulation.observe()['achieved_goal']
+    for _ in range(2 * int(control_hz)):
+        before, seen = (
+            seen,
+            simulation.step(np.zeros((20, 4), np.float32)).observation['achieved_goal'],
+        )
+        is_fresh = (seen != before).any(axis=1)
+        lengths += repeated[is_fresh & (repeated > 0)].tolist()
+        repeated = np.where(is_fresh, 0, repeated + 1)
+    # Tracking may be lost again at once.
+    assert min(lengths) == int(control_hz / 2)
+
+
 def test_sensors_are_read_once_a_step_and_again_after_the_state_was_written() -> None:
     simulation = Simulation('FetchPush', 1, keeps_data=True, disturbances='hardware')
     simulation.reset(seed=0)

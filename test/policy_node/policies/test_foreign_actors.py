@@ -170,12 +170,13 @@ def test_stable_baselines3_model_answers_as_it_does_there(algorithm, tmp_path):
         load_policy(path, trust=True)
 
 
-def test_a_model_acts_with_the_statistics_beside_it(tmp_path, caplog):
+@pytest.mark.parametrize('algorithm', ['A2C', 'PPO'])
+def test_a_model_acts_with_the_statistics_beside_it(algorithm, tmp_path, caplog):
     library = pytest.importorskip('stable_baselines3')
     vec_env = pytest.importorskip('stable_baselines3.common.vec_env')
     env = vec_env.DummyVecEnv([lambda: gymnasium.make('fetch_hand_sim/FetchReach-v0')])
     env = vec_env.VecNormalize(env, norm_reward=False)
-    model = library.PPO(
+    model = getattr(library, algorithm)(
         'MultiInputPolicy', env, n_steps=64, policy_kwargs={'net_arch': [8]}, seed=1
     )
     model.learn(64)
@@ -183,6 +184,7 @@ def test_a_model_acts_with_the_statistics_beside_it(tmp_path, caplog):
     model.save(path)
     observation = observations(REACH)
     plain = load_policy(path, 'FetchReach', trust=True)
+    assert plain.description == f'Stable-Baselines3 {algorithm} model_64_steps.zip'
     assert 'model_64_steps.zip has no vecnormalize.pkl' in caplog.text
     caplog.clear()
     wanted, _ = model.predict(env.normalize_obs(observation), deterministic=True)

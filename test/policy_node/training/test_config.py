@@ -167,6 +167,7 @@ def test_bad_assignments_are_refused(text, match):
         ({**PPO, 'overlap': True}, 'algorithm ppo needs overlap=false'),
         ({**PPO, 'random_epsilon': 0.2}, 'random_epsilon 0.2 has no effect'),
         ({**PPO, 'init_from': 'FetchReach'}, 'init_from excludes algorithm ppo'),
+        ({**PPO, 'first_distance': 2.0}, 'first_distance 2.0 has no effect'),
         ({**PPO, 'noise_std': 0.0}, 'noise_std 0.0; allowed: 1e-06 or more'),
         ({'importance': 'decision'}, 'has no effect: it needs algorithm ppo'),
         ({'goals': 'outcome=.8'}, 'goals outcome needs algorithm ppo'),
