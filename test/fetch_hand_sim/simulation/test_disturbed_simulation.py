@@ -122,17 +122,13 @@ def test_a_stale_pose_is_repeated_while_pushes_move_the_object() -> None:
 def test_lost_tracking_returns_after_half_a_second(control_hz: float) -> None:
     disturbances = {'object': {'noise': 0.01, 'lost': 0.02}}
     simulation = Simulation('FetchPush', 20, control_hz=control_hz, disturbances=disturbances)
-    simulation.reset(seed=0)
+    before = simulation.reset(seed=0)['observation'][:, 3:6]
     repeated, lengths = np.zeros(20, np.int64), []
-    seen = simulation.observe()['achieved_goal']
     for _ in range(2 * int(control_hz)):
-        before, seen = (
-            seen,
-            simulation.step(np.zeros((20, 4), np.float32)).observation['achieved_goal'],
-        )
+        seen = simulation.step(np.zeros((20, 4), np.float32)).observation['observation'][:, 3:6]
         is_fresh = (seen != before).any(axis=1)
         lengths += repeated[is_fresh & (repeated > 0)].tolist()
-        repeated = np.where(is_fresh, 0, repeated + 1)
+        repeated, before = np.where(is_fresh, 0, repeated + 1), seen
     # Tracking may be lost again at once.
     assert min(lengths) == int(control_hz / 2)
 
