@@ -88,7 +88,7 @@ def decode_status(message: Any) -> dict[str, str]:
 
 
 def answer_label(stamp: int) -> str:
-    """Return the layout label of a command that answers the observation with this stamp."""
+    """Return the label in a command's `layout` that names the observation with this stamp."""
     return f'answers {stamp:019d}'
 
 
@@ -136,7 +136,7 @@ _FIELDS = {
 
 
 def _build_geometry(name: str, values: Iterator[float]) -> Any:
-    """Return a geometry_msgs message of type `name`, filled from the next values."""
+    """Return a geometry_msgs message of type `name`; take its numbers from the iterator."""
     if name in _FIELDS:
         parts = {field: _build_geometry(kind, values) for field, kind in _FIELDS[name].items()}
     else:
@@ -366,7 +366,7 @@ class TopicCodec:
         return runs
 
     def _slot(self, marker: float) -> int:
-        """Return the position of the number `marker` in the body of the template, in float64s."""
+        """Return the position of `marker` in the template, in float64s after the CDR header."""
         pattern = _FLOAT.pack(marker)
         offset = self._template.find(pattern) - _BODY
         if self._template.count(pattern) != 1 or offset % _FLOAT.size:

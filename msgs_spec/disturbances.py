@@ -70,7 +70,7 @@ class Kind:
         return min(max(value**strength if self.is_factor else moved, self.lowest), self.highest)
 
     def drawn(self, span: Span, share: float) -> float:
-        """Return a number of the range `span`: its lower limit for `share` 0, its upper for 1."""
+        """Return the number at position `share`, 0 <= share < 1, between the limits `span`."""
         lowest, highest = span
         if self.is_whole:
             return float(lowest + int(share * (highest - lowest + 1)))
@@ -88,14 +88,14 @@ SHIFT = Kind(0.0, -1.0, 1.0)
 
 
 def _off(kind: Kind) -> Any:
-    """Return a field that is off by default."""
+    """Return a dataclass field whose default switches the disturbance off."""
     default = (kind.off, kind.off) if kind.is_range else kind.off
     return field(default=default, metadata={'kind': kind})
 
 
 @dataclass(frozen=True)
 class _Group:
-    """Base of the groups of disturbances; checks the fields and converts them by `Kind`."""
+    """Base class of the groups; checks each field, and turns a range given as n into (n, n)."""
 
     def __post_init__(self) -> None:
         for each in fields(self):
@@ -128,7 +128,7 @@ class JointDisturbance(_Group):
     """Errors of the joint sensors, and of the poses computed from them (gripper, fingertips).
 
     Attributes:
-        latency: Delay, ticks.
+        latency: Delay, ticks. Sliding joints have only this error.
         noise: Standard deviation of white noise, rad.
         bias: Standard deviation of an offset that lasts an episode, rad.
         velocity_noise: Standard deviation of white noise, rad/s.
@@ -292,8 +292,8 @@ def read_disturbances(given: str | Mapping[str, Any] | Disturbances | None) -> D
 
     Args:
         given: A preset (`mild`, `hardware`, `severe`), optionally scaled (`hardware*0.5`); the path
-            of a JSON or YAML file; JSON text that begins with `{`; a mapping; or `none` or None for
-            no disturbances. Other values raise ValueError.
+            of a JSON or YAML file; JSON text that begins with `{`; a mapping; `Disturbances`; or
+            `none`, `off`, '' or None for no disturbances. Invalid values raise ValueError.
     """
     if given is None or given in ('', 'none', 'off'):
         return Disturbances()

@@ -310,10 +310,10 @@ def _is_allowed(spec: ParameterSpec, value: object) -> bool:
 
 
 def unknown_parameter(specs: Sequence[ParameterSpec], name: str) -> str | None:
-    """Return a warning about a parameter that a node does not have.
+    """Return a warning about a parameter that a node with the parameters `specs` does not have.
 
-    Returns None for parameters of ROS and of the other nodes, because several nodes often share a
-    parameter file.
+    Returns None for parameters of ROS and of any node in `NODES`, because several nodes often share
+    a parameter file.
     """
     is_known = any(name in (spec.name, spec.former) for node in NODES.values() for spec in node)
     if is_known or name == 'use_sim_time' or name.startswith(_ROS_QOS):

@@ -28,7 +28,7 @@ class CommandPart:
     Attributes:
         lower: Smallest value after clipping.
         upper: Largest value after clipping.
-        unit: SI unit, or 'x 0.05 m' for the dimensionless axes of Fetch.
+        unit: SI unit; for Fetch, the meaning of the dimensionless value, such as 'x 0.05 m'.
     """
 
     name: str
@@ -67,7 +67,7 @@ class RobotSpec:
         return all(part.lower == -1.0 and part.upper == 1.0 for part in self.command)
 
     def with_joint_prefix(self, prefix: str) -> RobotSpec:
-        """Return a copy whose joint names have the prefix `prefix`, such as `rh_`."""
+        """Return a copy whose joint names begin with `prefix`, such as `rh_`, not `robot0:`."""
 
         def renamed(name: str) -> str:
             is_joint = name.startswith(JOINT_PREFIX)
@@ -79,7 +79,11 @@ class RobotSpec:
 
 
 def read_joint_prefix(robot: RobotSpec, prefix: str) -> str:
-    """Return the joint prefix for the parameter `joint_prefix`; ValueError if it has no effect."""
+    """Return the joint prefix for the value `prefix` of the parameter `joint_prefix`.
+
+    `model` gives `robot0:`. Other values are returned as they are, or raise ValueError if no joint
+    of the robot begins with `robot0:`.
+    """
     if prefix in (MODEL_PREFIX, JOINT_PREFIX):
         return JOINT_PREFIX
     if robot.with_joint_prefix(prefix).joints == robot.joints:

@@ -33,7 +33,10 @@ def one_of(given: object, allowed: Sequence[Name], meaning: str) -> Name:
 
 
 def entries(owner: str, values: Any, allowed: Sequence[str]) -> dict[str, Any]:
-    """Return a mapping as a dictionary; raise ValueError for another type or an unknown key."""
+    """Return the mapping `values`, which errors call `owner`, as a dictionary.
+
+    Another type, or a key that is not in `allowed`, raises ValueError.
+    """
     if not isinstance(values, Mapping):
         raise ValueError(
             f'{owner}: {one_line(values, _SHOWN)!r} given; allowed: a mapping of '

@@ -268,7 +268,7 @@ def topics(task: TaskSpec) -> tuple[TopicSpec, ...]:
     """Return all topics of a task.
 
     The order is part of the contract. Published topics come first, in the order of publication:
-    `applied_command` is the last topic of every tick, and `episode_status` follows at some ticks.
+    `applied_command` is the last topic of a step, and `episode_status` follows at some ticks.
     Subscribed topics come next.
 
     To add a topic of every tick, insert it before `applied_command`, add its value to
@@ -326,14 +326,17 @@ SHOWN = (
 
 
 def _scalar(name: str, unit: str, text: str) -> TopicSpec:
-    """Return a topic with one number, in `x` of a vector: ROS has no number with a stamp."""
+    """Return topic `scalars/<name>`, a number in `x` of a vector: ROS has no stamped number."""
     layout = (VectorPart(name, 1, unit),)
     return TopicSpec(f'{_SCALARS}{name}', 'geometry_msgs/msg/Vector3Stamped', text, layout)
 
 
 @lru_cache(maxsize=_TASKS)
 def scalar_topics(task: TaskSpec) -> tuple[TopicSpec, ...]:
-    """Return the topics with single numbers of a tick for plots, stamped as the tick."""
+    """Return the topics of a task for plots: distance, rotation, reward and is_success.
+
+    A task has `distance` and `rotation` only if they count for success. Stamps are those of ticks.
+    """
     found = []
     if task.position_counts:
         found.append(_scalar('distance', 'm', 'From the achieved to the desired position.'))

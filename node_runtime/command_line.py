@@ -156,8 +156,8 @@ def run_command(name: str, run: Callable[[], int]) -> int:
     """Run the body of a command and return the exit code of the process.
 
     Returns:
-        The result of `run`; 1 or 2 for a `CommandError`; 130, 143 or 129 for SIGINT, SIGTERM or
-        SIGHUP, after the line `stopping`; 141 for a closed output.
+        The result of `run`; 2 for a `UsageError`; 1 for another `CommandError` or a full disk; 141
+        for a closed output; 130, 143 or 129 for SIGINT, SIGTERM or SIGHUP, after `stopping`.
     """
     make_output_usable()
 
@@ -172,7 +172,7 @@ def run_command(name: str, run: Callable[[], int]) -> int:
 
 
 def _exit_code(name: str, run: Callable[[], int]) -> int:
-    """Run the body of a command and turn its errors into exit codes."""
+    """Return the result of `run`, or print its error and return its code as in `run_command`."""
     try:
         code = run()
         sys.stdout.flush()
@@ -194,9 +194,10 @@ def _exit_code(name: str, run: Callable[[], int]) -> int:
 
 
 def _unclaimed_signals() -> list[signal.Signals]:
-    """Return the signals that a command handles; none if the program handles SIGINT itself.
+    """Return those of SIGINT, SIGTERM and SIGHUP that have the default handler.
 
-    A process that ignores SIGINT still handles the other signals.
+    Returns [] if the program has its own handler of SIGINT. If SIGINT is ignored, as in background
+    processes of shells, the other two are still returned.
     """
     if not (has_default_interrupt() or _ignores_interrupt()):
         return []
@@ -213,7 +214,7 @@ def _ignores_interrupt() -> bool:
 def make_output_usable() -> None:
     """Replace a missing stdout or stderr, and escape characters that their encoding lacks.
 
-    Programs that handle SIGINT themselves keep their streams.
+    Does nothing if the program has its own handler of SIGINT.
     """
     if not (has_default_interrupt() or _ignores_interrupt()):
         return

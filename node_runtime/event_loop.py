@@ -25,9 +25,9 @@ _CLOCK = getattr(time, 'CLOCK_BOOTTIME', time.CLOCK_MONOTONIC)
 class EventLoop:
     """Runs the callbacks of one node in the thread that owns the node.
 
-    rclpy's EventsExecutor takes half the CPU time of the wait-set executor per message. rclpy
-    before 7.1.4 lacks it. Only its `spin_once` is used, because `spin` runs no callback in some
-    builds.
+    It uses rclpy's EventsExecutor, which takes half the CPU time of SingleThreadedExecutor per
+    message. With rclpy before 7.1.4, which lacks EventsExecutor, it uses SingleThreadedExecutor.
+    It calls only `spin_once`, because `spin` of EventsExecutor runs no callback in some builds.
     """
 
     def __init__(self, node: Node) -> None:

@@ -101,10 +101,11 @@ def node_main(
     shared_memory: bool = False,
     second_signal_ends: bool = False,
 ) -> int:
-    """Run a node of `NODES` as a process, or print its help; return the exit code of `run_node`.
+    """Run a node of this project as a process, or print its help; return the exit code.
 
-    `node_class` names the class of the node as `package.module:Class`. The class has the methods
+    The help begins with `summary`. `node_class` is `package.module:Class`, a class with the methods
     `run(stop)` and `destroy_node()`. A ValueError of its constructor is reported as wrong usage.
+    For `shared_memory` see `run_node`; for `second_signal_ends` see `StopSignals.second_ends`.
     """
     given = sys.argv[1:] if args is None else args
     if '-h' in given or '--help' in given:
@@ -181,8 +182,8 @@ def run_node(
 
     Args:
         run: Runs until its work is done or a signal is recorded.
-        shared_memory: Whether Fast DDS may use shared memory (see `ros`). Set it for nodes that
-            send pictures and for which no robot waits.
+        shared_memory: Whether Fast DDS may use shared memory, where a stopped subscriber can block
+            the node. Set it for nodes that send pictures and that `sim_node` never waits for.
 
     Returns:
         0 after the work is done or a signal; 2 for wrong usage; 1 for a failure. Errors print one

@@ -111,7 +111,7 @@ def full_name(namespace: str, name: str) -> str:
 
 
 def count_publishers(node: Node, topic: str) -> int:
-    """Return the number of publishers of a topic, whose name the node may remap."""
+    """Return the number of publishers of a topic, after the remappings of `node`."""
     return int(node.count_publishers(node.resolve_topic_name(topic)))
 
 
@@ -135,7 +135,7 @@ class SubscriberWatch:
         self._changed_at = 0.0
 
     def expect_more(self) -> None:
-        """Restart the wait for subscriptions, because a node has appeared."""
+        """Make `are_connected` wait for the subscriptions of a node that has just appeared."""
         self._changed_at = time.monotonic()
 
     def update(self) -> bool:
@@ -147,9 +147,10 @@ class SubscriberWatch:
         return any(have > had for have, had in zip(self._counts, before, strict=True))
 
     def are_connected(self) -> bool:
-        """Return whether all subscribers are connected and their number has not just changed.
+        """Return whether the publishers are connected to all subscribers that `update` counted.
 
-        After 6 s without changes, unconnected subscribers count as incompatible and are ignored.
+        Returns False for 0.2 s after each change of the number of subscribers. After 6 s without
+        changes, unconnected subscribers count as incompatible and are ignored.
         """
         quiet_for = time.monotonic() - self._changed_at
         if quiet_for > _PATIENCE:

@@ -86,7 +86,8 @@ def set_callback(
 ) -> Callable[[list[Parameter]], SetParametersResult]:
     """Return a callback for `Node.add_on_set_parameters_callback` that checks new values.
 
-    Parameters of ROS itself are accepted, except `use_sim_time: true` if `makes_time`.
+    Parameters that are not in `specs`, such as those of ROS, are accepted. With `makes_time`, for
+    the node that defines simulated time, `use_sim_time: true` is rejected.
     """
     from rcl_interfaces.msg import SetParametersResult
 

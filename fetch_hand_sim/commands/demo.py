@@ -116,7 +116,7 @@ class Watcher:
         )
 
     def close(self, exit_code: int) -> None:
-        """Destroy the ROS node; if that fails, end this process with `exit_code`."""
+        """Destroy the ROS node; end this process with `exit_code` if that takes over 10 s."""
         self._executor.remove_node(self._node)
         destroy(self._node, exit_code)
 
@@ -159,7 +159,10 @@ class Demo:
             watcher.close(exit_code)
 
     def _play(self, policy: str, watcher: Watcher, stop: StopSignals) -> int:
-        """Run the nodes and return the exit code; print their output after a failure."""
+        """Run both nodes until the episodes are logged; return 0, or 1 after a failure.
+
+        After a failure, print the output of the nodes. `policy` is as for the option `--policy`.
+        """
         began = time.monotonic()
         with open_log('demo') as output:
             policy_parameters = {'policy': policy, 'trust': self._options.trust}

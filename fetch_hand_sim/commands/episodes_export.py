@@ -1,7 +1,7 @@
 """Write logged episodes as Parquet, Minari or LeRobot datasets, one for each task.
 
 Exit code 0: all episodes are in the datasets; 1: an episode was skipped (stderr names it) or a
-dataset could not be written; 2: bad usage.
+dataset could not be written; 2: bad usage, or no readable episode.
 """
 
 from __future__ import annotations

@@ -84,7 +84,10 @@ def _cells(episode: EpisodeSummary) -> list[str]:
 
 
 def _name(file: Path) -> str:
-    """Return the name of an episode's bag directory, or the file name without a bag."""
+    """Return the name of the bag directory that contains the file of an episode.
+
+    If the directory has no `metadata.yaml`, return the file name without `_0.mcap`.
+    """
     is_bag = (file.parent / 'metadata.yaml').is_file()
     return file.parent.name if is_bag else file.stem.removesuffix('_0')
 

@@ -85,7 +85,10 @@ def start_node(
 def start_nodes(
     nodes: Mapping[str, Mapping[str, object]], output: IO[str], namespace: str = ''
 ) -> list[subprocess.Popen[str]]:
-    """Start several nodes, given as parameters by executable; if one fails, stop the others."""
+    """Start several nodes and return their processes; if one cannot start, stop the others.
+
+    `nodes` maps the name of each executable to the ROS parameters of the node.
+    """
     started: list[subprocess.Popen[str]] = []
     try:
         for name, parameters in nodes.items():

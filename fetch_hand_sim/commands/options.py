@@ -27,7 +27,10 @@ def add_filter_options(parser: argparse.ArgumentParser) -> None:
 
 
 def is_wanted(options: argparse.Namespace, task: str | None, episode: HasOutcome) -> bool:
-    """Return whether an episode passes; unknown success fails `--success` and `--failure`."""
+    """Return whether an episode of `task` matches the filters of `add_filter_options`.
+
+    An episode whose success is unknown matches neither `--success` nor `--failure`.
+    """
     return (
         options.task in (None, task)
         and options.success in (None, episode.outcome.is_success)

@@ -101,7 +101,7 @@ class _Dataset:
         self._write_json('meta/info.json', self._info(rows))
 
     def _row(self, columns: Columns, where: dict[str, int]) -> Row:
-        """Return the row of an episode for `meta/episodes`; `where` is its data file."""
+        """Return an episode's row for `meta/episodes`; `where` numbers its chunk and data file."""
         index = columns['index']
         return {
             'episode_index': int(columns['episode_index'][0]),
@@ -122,7 +122,10 @@ class _Dataset:
         rows: Sequence[Row],
         where: dict[str, int],
     ) -> list[Histogram]:
-        """Write the episodes of one data file as one film, and add their place in it to `rows`."""
+        """Write the episodes of one data file as one film; return a colour histogram of each.
+
+        Add to each of `rows` the film file, start and end time of the episode, and its statistics.
+        """
         path = self._file(_FILM, video_key=camera.key, **where)
         colors = write_episodes(path, episodes, camera, self.rate)
         begins = accumulate((row['length'] for row in rows), initial=0)
@@ -208,7 +211,7 @@ def _flat(found: Row) -> Row:
 
 
 def _tasks(spec: TaskSpec) -> Any:
-    """Return the table of tasks, with one row; pandas uses the task name as its index."""
+    """Return the Arrow table `meta/tasks`: one row, whose index in pandas is the task name."""
     names = '__index_level_0__'
     number = {'pandas_type': 'int64', 'numpy_type': 'int64', 'metadata': None}
     name = {'pandas_type': 'unicode', 'numpy_type': 'object', 'metadata': None}
@@ -347,7 +350,7 @@ class Camera:
         return f'observation.images.{self.name or "scene"}'
 
     def feature(self, rate: float) -> dict[str, Any]:
-        """Return the entry of this column in `meta/info.json`; `rate` is pictures per second."""
+        """Return the entry of the column `key` in `meta/info.json`; `rate` is frames per second."""
         return {
             'dtype': 'video',
             'shape': [self.height, self.width, 3],

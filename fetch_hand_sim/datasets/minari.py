@@ -87,7 +87,7 @@ def export_minari(by_task: ByTask, directory: Path, name: str) -> dict[str, str]
 def _buffers(
     collector: Any, episodes: Sequence[EpisodeArrays], advance: Callable[[int], None]
 ) -> Iterator[Any]:
-    """Yield each episode as an `EpisodeBuffer` of Minari, then report one with `advance`."""
+    """Yield each episode as a Minari `EpisodeBuffer`; call `advance(1)` after each for progress."""
     for index, episode in enumerate(episodes):
         yield collector.EpisodeBuffer(
             id=index,
@@ -166,7 +166,7 @@ def _minari_folder(directory: Path, dataset_ids: Iterable[str]) -> Iterator[None
 
 
 def _environment(episode: EpisodeArrays) -> Any:
-    """Return the spec from which Minari's `recover_environment` makes the environment."""
+    """Return the Gymnasium `EnvSpec` of an episode, for Minari's `recover_environment`."""
     register_environments()
     record = episode.record
     spec = copy.deepcopy(gymnasium.spec(environment_id(episode.spec.name)))

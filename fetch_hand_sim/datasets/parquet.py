@@ -22,7 +22,7 @@ _OBSERVATIONS = ('observation', 'achieved_goal', 'desired_goal')
 
 
 def export_parquet(by_task: ByTask, directory: Path) -> dict[str, list[Path]]:
-    """Write two tables for each task.
+    """Write two tables for each task; return the paths of the two files by task.
 
     `<task>.parquet` has N + 1 rows for an episode of N steps, one per observation. The first
     columns are `episode_index`, `step`, `timestamp` in seconds since the reset, and the three

@@ -52,7 +52,7 @@ def require_module(module: str) -> Any:
 
 @contextmanager
 def alone_in(directory: Path) -> Iterator[None]:
-    """Create a folder if it is missing, and lock it until the end of the block."""
+    """Lock a folder, created if missing, until the block ends; wait for another process's lock."""
     directory.mkdir(parents=True, exist_ok=True)
     descriptor = os.open(directory, os.O_RDONLY | os.O_DIRECTORY)
     try:
@@ -66,10 +66,10 @@ def alone_in(directory: Path) -> Iterator[None]:
 
 @contextmanager
 def appearing(directory: Path, names: Iterable[str]) -> Iterator[Path]:
-    """Yield a hidden folder; its entries `names` move to `directory` at the end of the block.
+    """Yield a hidden folder; move its entries `names` to `directory` at the end of the block.
 
     Raises:
-        ExportError: If `directory` already has an entry of such a name, or the disk fails.
+        ExportError: If `directory` already contains one of `names`, or the disk fails.
     """
     targets = {name: directory / name for name in names}
     try:

@@ -166,7 +166,7 @@ def read_each(
     read: Callable[[Path], Read],
     on_skip: Callable[[EpisodeReadError], object] | None = None,
 ) -> Iterator[Read]:
-    """Yield `read(path)` for each path; pass each error to `on_skip`, or raise it for None."""
+    """Yield `read(path)` for each path; pass EpisodeReadError to `on_skip`, or raise it without."""
     for path in paths:
         try:
             result = read(path)
@@ -208,6 +208,7 @@ def claim(directory: Path, name: str) -> BufferedWriter:
     Raises:
         EpisodeExistsError: If an episode of this name is finished, being written or cut off. If
             several processes try at the same time, one succeeds.
+        OSError: If the directory or file cannot be created.
     """
     active = active_path(directory, name)
     try:
@@ -245,7 +246,7 @@ def require_free_space(directory: Path, minimum_bytes: int) -> None:
 
 
 def lock(stream: IO[bytes]) -> None:
-    """Lock a file to mark that this process writes it; closing the file releases the lock."""
+    """Lock a file that this process writes, until it is closed; wait for another process's lock."""
     # File systems without locks only lose the distinction between running and cut-off episodes.
     with suppress(OSError):
         fcntl.flock(stream, fcntl.LOCK_EX)

@@ -201,7 +201,7 @@ def _check_chunk_indexes(
 
 
 def _check_chunk_times(contents: Contents, messages: Messages) -> None:
-    """Check the first and last log time of each chunk, which readers use to skip chunks."""
+    """Raise ValueError if the times in a chunk header are neither 0 nor those of its messages."""
     order = np.argsort(messages.starts)
     starts, times = messages.starts[order], messages.headers['log_time'][order]
     for chunk in contents.chunks:
@@ -236,7 +236,7 @@ def _check_message_indexes(contents: Contents, messages: Messages) -> None:
 def _check_statistics(
     data: bytes, summary: Summary, contents: Contents, messages: Messages
 ) -> None:
-    """Check the recorded counts and times; 0 is allowed for counts other than of messages."""
+    """Raise ValueError for wrong counts or log times; all counts but those of messages may be 0."""
     if len(summary[Opcode.STATISTICS]) > 1:
         raise ValueError('ambiguous: two records of statistics')
     for position, end in summary[Opcode.STATISTICS]:

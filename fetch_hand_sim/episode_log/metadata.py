@@ -1,6 +1,7 @@
 """Write and parse the two metadata records of an episode, `episode` and `episode_result`.
 
-Files may come from unknown sources. Numbers must be within bounds, and names must be allowed ones.
+Files may come from unknown sources. So parsing accepts only numbers within bounds, and only known
+names of tasks, reward types, success rules and timings.
 """
 
 from __future__ import annotations

@@ -200,8 +200,9 @@ def _why_unfinished(file: Path) -> str:
 
 
 def require_contract(metadata: dict[str, str], contents: Contents) -> None:
-    """Raise ValueError if a topic of a file does not have a name, type and definition of the task.
+    """Raise ValueError if a file has topics that its task does not allow.
 
+    Name, type, encoding and message definition of each topic must be those of `contract_topics`.
     All topics must have the same namespace. A file with an unknown task is not checked.
     """
     try:

@@ -180,7 +180,10 @@ class Chunk:
 
 
 class MessageIndex(NamedTuple):
-    """A message index record; `chunk` is the number of its chunk, `position` its byte offset."""
+    """A message index record of MCAP: log time and offset of the messages of a channel in a chunk.
+
+    `chunk` is a number in `Contents.chunks`, `position` the byte offset of the record in the file.
+    """
 
     chunk: int
     position: int
@@ -251,7 +254,7 @@ class Contents:
             self._take_attachment(data[start:end], position, end - position)
 
     def define(self, opcode: int, content: bytes, offset: int = 0) -> None:
-        """Parse and store a schema or channel; `offset` is its byte offset in the chunk."""
+        """Parse and store a schema or channel; `offset` is its position in the unpacked chunk."""
         id = int.from_bytes(content[:2], 'little')
         known = self._definitions.get((opcode, id))
         if known == content:
@@ -428,8 +431,8 @@ class Messages:
 def split_records(data: bytes) -> Iterator[tuple[int, int, int]]:
     """Yield opcode, start and end (byte offsets) of each record of a file, from its header on.
 
-    `data` may end with the magic bytes, which are no record; then stop at the footer. A file that
-    ends within a record, or has more than `MAX_RECORDS` records, raises ValueError.
+    A missing header, a cut-off record and more than `MAX_RECORDS` records raise ValueError. The
+    caller removes the magic bytes at the end from `data`, or stops at the footer.
     """
     magic = len(MCAP0_MAGIC)
     if data[:magic] != MCAP0_MAGIC:

@@ -1,7 +1,7 @@
 """Find episodes that a killed process or a full disk cut off, and make valid bags of them.
 
-The hidden directory of a cut-off episode is a leftover. An entry that has such a name, but was not
-written by this package, is only reported. Links are not followed, and other files are not opened.
+The hidden directory `.<name>.active` of a cut-off episode is a leftover. It is only reported, not
+recovered, if it contains links or files that this package does not write.
 """
 
 from __future__ import annotations
@@ -54,8 +54,8 @@ class Leftover:
         name: Name of the episode.
         path: Its hidden directory.
         age_s: Seconds since the last write.
-        problem: Why the directory is not the rest of an episode, or cannot be read; '' if it can
-            be recovered.
+        problem: Why recovery rejects the path: it is unreadable, is no directory, or contains
+            entries that this package does not write; '' otherwise.
     """
 
     name: str
@@ -137,8 +137,8 @@ def recover_episode(leftover: Path | str) -> Path | None:
 
     Raises:
         EpisodeInUseError: If another process writes, recovers or has recovered the episode.
-        EpisodeLogError: If the episode is ambiguous or not written by this package, or the disk
-            fails. The episode stays unfinished then.
+        EpisodeLogError: If the episode is ambiguous or not written by this package, a finished
+            episode has its name, or the disk fails. The episode stays unfinished then.
     """
     leftover = Path(leftover)
     name = files.active_name(leftover)
@@ -287,7 +287,10 @@ def _replaced(file: Path, remains: _Remains, aside: Path) -> Iterator[None]:
 def _write(
     stream: BinaryIO, file: Path, remains: _Remains, records: dict[str, dict[str, str]]
 ) -> str:
-    """Write the readable records as a valid file; return the text of its `metadata.yaml`."""
+    """Write the readable records as a valid file; return the text of its `metadata.yaml`.
+
+    `records` are the contents of the metadata records by name.
+    """
     contents, metadata = remains.contents, checked_strings(records[EPISODE])
     messages = contents.messages()
     specs = contract_topics(parse_task(metadata))
@@ -310,7 +313,11 @@ def _write(
 
 
 def _outcome(values: dict[str, list[bytes]], specs: dict[str, TopicSpec]) -> EpisodeOutcome:
-    """Compute steps, return and success from the messages up to the last whole tick."""
+    """Compute steps, return and success from the messages up to the last whole tick.
+
+    `values` are the CDR messages on `reward`, `is_success` and `applied_command`, in this order.
+    All three results are None if messages are missing or invalid.
+    """
     cut_off = EpisodeOutcome(is_complete=False, reason=RECOVERED)
     rewards, successes, commands = values.values()
     # `applied_command` comes last among the topics with a message per tick.

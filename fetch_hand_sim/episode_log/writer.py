@@ -52,8 +52,9 @@ class ReceivedAllowance:
     ) -> bool:
         """Count a received message of `size` bytes; return whether to log it.
 
-        Messages that the robot rejected (`is_refused`) may use at most half of the limit, so that
-        room remains for valid messages. `omitted` lists them as `<topic> (refused)`.
+        `has_room=False` means that the file is full: the message is not logged. Messages that the
+        robot rejected (`is_refused`) may use at most half of the limit, so that room remains for
+        valid messages. `omitted` lists them as `<topic> (refused)`.
         """
         share = 2 if is_refused else 1
         if (
@@ -210,7 +211,7 @@ class EpisodeWriter:
         return True
 
     def store(self) -> Path | None:
-        """Do the second half of `finish`: flush to disk (fsync), rename the hidden directory."""
+        """Do the second half of `finish`: fsync and rename; return the bag's directory, or None."""
         if self._description is None:
             return self._completed
         try:

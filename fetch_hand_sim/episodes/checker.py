@@ -111,12 +111,10 @@ class CheckResult:
 
 @lru_cache(maxsize=1)
 def _reference(task: str, **rules: Any) -> tuple[Simulation, RecordingContext, str]:
-    """Return what an episode is compared with: simulation, recording context and model hash.
+    """Return simulation, recording context and version 1.0 model hash, to check an episode with.
 
-    The hash is computed as version 1.0 of this package did, for episodes recorded by it. `rules`
-    are arguments of `Simulation`.
-
-    The last result is cached, because most episodes of a folder have the same settings.
+    The hash is that of `former_model_sha256`, which episodes of version 1.0 contain. `rules` are
+    arguments of `Simulation`. The last result is cached: most episodes of a folder share settings.
     """
     simulation = Simulation(task, num_threads=1, **rules)
     context = RecordingContext(simulation, with_compiled_model=False)
@@ -174,7 +172,11 @@ def check_episode(path: Path) -> CheckResult:
 def _start_differences(
     episode: Episode, stamp_ns: int, here: dict[str, str], mjcf: bytes, result: CheckResult
 ) -> Iterator[Difference]:
-    """Compare the metadata and the model; add changed software to `result` and yield the rest."""
+    """Compare the recorded metadata and MJCF text with `here` and `mjcf`; yield the differences.
+
+    `here` is the metadata of a recording made now. Other software versions are no differences; they
+    are added to `result.changed`.
+    """
     recorded = episode.metadata
     for name, value in here.items():
         is_software = name in _SOFTWARE or name.endswith('_version')
@@ -191,7 +193,7 @@ def _start_differences(
 
 
 def _topic_differences(episode: Episode, ticks: list[LoggedTick]) -> Iterator[Difference]:
-    """Yield differences of type hashes, QoS profiles, publish times and sequence numbers."""
+    """Yield type hashes, QoS profiles, publish times and sequence numbers that are wrong."""
     stamps = [tick.stamp_ns for tick in ticks]
     for name, spec in logged_topics(episode).items():
         logged = episode.topics[name]
@@ -315,7 +317,7 @@ class _Received:
         self._lacks_commands = is_recovered or bool(_COMMANDS & outcome.received_not_logged.keys())
 
     def differences(self, number: int, command: Array) -> Iterator[tuple[str, object, object]]:
-        """Yield field, logged and expected value if another command was received last."""
+        """Yield (field, applied, received) if `command` of tick `number` was not received last."""
         if not number:
             self._commands.start_episode(self._runner.resting_command())
         if not self._lacks_commands and self._commands.has_fresh_command:

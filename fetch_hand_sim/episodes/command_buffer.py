@@ -27,7 +27,7 @@ _FAR = 2.0
 class CommandBuffer:
     """Checks and stores the newest command of one robot.
 
-    The robot holds its position after `timeout` seconds without a command; 0 means never.
+    The robot holds its position after `timeout` wall-clock seconds without a command; 0: never.
 
     Attributes:
         far_out: Number of commands that were far out of range, probably in another unit.
@@ -64,15 +64,15 @@ class CommandBuffer:
         return self._command is not None
 
     def age(self) -> float | None:
-        """Return the seconds since the last valid command of any episode; None without one."""
+        """Return the wall-clock seconds since the last valid command of any episode, or None."""
         return None if self._received_at is None else self._clock() - self._received_at
 
     def start_episode(self, resting_command: ArrayLike) -> None:
         """Drop the last command, because an episode starts.
 
         Args:
-            resting_command: (action size,) applies until the first command. Joints that a first
-                named command does not name keep these values.
+            resting_command: (action size,) applies until the first command. If that is a command
+                by joint name, the joints it leaves out keep these values.
         """
         self._resting = np.array(resting_command, dtype=np.float64)
         self._command = None

@@ -161,7 +161,7 @@ class EpisodeGenerator:
 
 
 def _completed(waiting: deque[Future[LoggedEpisode]]) -> Iterator[LoggedEpisode]:
-    """Yield the results in order and remove them from `waiting`; Ctrl-C leaves the others there."""
+    """Yield the results in order; after Ctrl-C, `waiting` contains those not yet yielded."""
     while waiting:
         logged = waiting[0].result()
         waiting.popleft()

@@ -236,7 +236,7 @@ class EpisodeRecorder:
             self._report_slow(now)
 
     def _oldest(self, now: float) -> float:
-        """Return when the oldest message arrived that is not yet passed to the operating system."""
+        """Return when the oldest message not yet passed to the OS was queued; `now` without one."""
         since = self._unflushed_since
         if since is not None:
             return since

@@ -61,7 +61,7 @@ def sense(simulation: Simulation) -> Sensed:
 
 
 def has_ended(ticks: Any, episode_ticks: int, has_diverged: Any) -> Any:
-    """Return whether episodes have ended: after `episode_ticks` ticks or at divergence."""
+    """Return whether an episode reached `episode_ticks` or diverged; for arrays, elementwise."""
     return has_diverged | (ticks >= episode_ticks)
 
 
@@ -94,7 +94,7 @@ class RobotEpisode:
         return self.status.phase == 'finished'
 
     def start(self, sensed: Sensed, index: int) -> Tick:
-        """Return tick 0 of robot `index`; `sensed` is its state right after the reset."""
+        """Return tick 0 of robot `index`; `sensed` was read from all robots after the reset."""
         disturbances = self._simulation.disturbances
         if not disturbances.is_off:
             self._disturbances = disturbances.to_json()
@@ -309,7 +309,7 @@ def accept_goal(
 
 
 def _check_stamp(runner: EpisodeRunner, stamp_ns: int) -> None:
-    """Raise ValueError if the stamp of a goal is before the running episode or in the future."""
+    """Raise ValueError for a goal's stamp outside of the running episode; 0 is always valid."""
     first, last = runner.current.first_stamp_ns, runner.stamp_ns
     if stamp_ns and not first <= stamp_ns <= last:
         raise ValueError(

@@ -64,7 +64,7 @@ class Roll:
 
 
 def check_kind(path: Path) -> None:
-    """Raise ValueError unless suffix and folder of the path allow a film or picture there."""
+    """Raise ValueError for an unknown suffix, a directory, a missing folder or a missing ffmpeg."""
     kind = path.suffix.lower()
     if kind not in (*MOVING, *STILL):
         raise ValueError(
@@ -79,7 +79,7 @@ def check_kind(path: Path) -> None:
 
 
 def check_size(path: Path, width: int, height: int) -> None:
-    """Raise ValueError unless the format of the path allows pictures of this size, pixels."""
+    """Raise ValueError if a side exceeds the limit of the file format, or the area 2^28 pixels."""
     kind = path.suffix.lower()
     largest = _LARGEST_SIDE.get(kind)
     if largest is not None and max(width, height) > largest:

@@ -135,7 +135,7 @@ def film_episode(env: gymnasium.Env[Any, Any], policy: Any, seed: int | None = N
         env: Made with `render_mode='rgb_array'`.
         policy: A function from observation to action; or an object with
             `predict(observation, state, deterministic=True)`, like the models of Stable-Baselines3.
-            A state of None is not passed.
+            `state` is the one that the last call returned; it is left out while it is None.
         seed: Seed of the reset; None continues the random generator.
 
     Raises:

@@ -72,11 +72,13 @@ def recording_of(arrays: EpisodeArrays) -> Recording:
 def load_recordings(
     path: Path, count: int, on_skip: Callable[[EpisodeReadError], None] | None = None
 ) -> list[Recording]:
-    """Read the first `count` episodes of a file or folder.
+    """Read the first `count` readable episodes of a file or folder.
 
     Args:
-        on_skip: Called with the error of each unreadable episode, which is left out; None raises
-            that error.
+        on_skip: Called with the error of each skipped episode; None raises the first error.
+
+    Raises:
+        EpisodeReadError: If no episode is readable; `on_skip` is not called then.
     """
     skipped: list[EpisodeReadError] = []
     each = read_each(find_playable(path), load_recording, on_skip and skipped.append)
@@ -98,7 +100,7 @@ def none_readable(errors: Sequence[EpisodeReadError]) -> EpisodeReadError:
 
 
 def find_playable(path: Path) -> list[Path]:
-    """Return the episodes of a file or folder, sorted by name; EpisodeReadError without one."""
+    """Return the paths of the episodes in a file or folder, sorted; EpisodeReadError if none."""
     paths = expand_episodes(path)
     if not paths:
         raise holds_no_episode(path)
@@ -137,7 +139,7 @@ class Studio:
         return renderer.render(frames[index], trail_of(frames, index))
 
     def plain(self, recording: Recording, index: int) -> Picture:
-        """Return the picture of one frame for learning: without trail and success colour."""
+        """Return the picture of one frame for data sets, without trail and success colour."""
         frame = recording.frames[self._index(recording, index)]
         frame = replace(frame, is_success=False)
         return self._renderer(recording.spec.name).render(frame, [])

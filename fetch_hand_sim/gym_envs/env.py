@@ -68,7 +68,7 @@ class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32
             The observation, and an empty dictionary.
 
         Raises:
-            ValueError: If an option is unknown or the goal is invalid.
+            ValueError: If an option is unknown or invalid.
             gymnasium.error.Error: If the seed is no integer or negative.
         """
         given = self._read_options(options, np.ones(1, dtype=bool))
@@ -88,7 +88,7 @@ class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32
     def step(
         self, action: NDArray[np.float32]
     ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Advance one tick.
+        """Advance one step.
 
         Args:
             action: (action size,), clipped to [-1, 1]; infinite values, too.
@@ -189,7 +189,7 @@ class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32
         return self.__dict__.copy()
 
     def _draws_goals(self) -> bool:
-        """Return whether the simulation draws goals; an overridden `_sample_goal` disables this."""
+        """Disable goal sampling if `_sample_goal` is overridden; return whether it is enabled."""
         draws_goals = not self.overrides('_sample_goal')
         self.simulation.task.draws_goals = draws_goals
         return draws_goals
@@ -257,16 +257,16 @@ class SharedPhysics:
 
     @property
     def is_shared(self) -> bool:
-        """True once the user has read `model` or `data` and may change or draw them."""
+        """True once the user has read `model` or `data`, and so can change or render them."""
         return self._shares_model or self.shares_data
 
     @property
     def shares_data(self) -> bool:
-        """True once the user has read `data` and may change or draw it."""
+        """True once the user has read `data`, and so can change or render it."""
         return self._data is not None
 
     def move_sites(self, sites: list[int], positions: Array) -> None:
-        """Move sites (n,), which only pictures use, to positions (n, 3) in their bodies, m."""
+        """Move marker sites with indices (n,) to positions (n, 3) in their body frames, m."""
         is_unchanged = self._is_unchanged()
         self._simulation.model.site_pos[sites] = positions
         if is_unchanged:
@@ -290,5 +290,5 @@ class SharedPhysics:
             self._simulation.read_data(0, self._data)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the state for `pickle` without `data`; a copy reads it from its simulation."""
+        """Return the state for `pickle` without `data`; a copy rebuilds `data` on first use."""
         return self.__dict__ | {'_data': None}

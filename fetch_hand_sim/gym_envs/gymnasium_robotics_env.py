@@ -89,13 +89,16 @@ CAMERAS: dict[str, dict[str, Any]] = {
 
 
 def _pictures(task: str, camera: Mapping[str, Any] | None) -> dict[str, Any]:
-    """Return size and camera of Gymnasium-Robotics' pictures, with the attributes `camera`."""
+    """Return `width`, `height` and `default_camera_config` of Gymnasium-Robotics.
+
+    The attributes in `camera` replace those of the default camera.
+    """
     view = {**CAMERAS[task_spec(task).robot.name], **(camera or {})}
     return {'width': SIZE, 'height': SIZE, 'default_camera_config': view}
 
 
 def as_reference(reward: Any, reward_type: str) -> Any:
-    """Return one reward or an array as float32 if rewards are sparse, else unchanged."""
+    """Convert sparse rewards to float32, as Gymnasium-Robotics does; return others unchanged."""
     return reward.astype(np.float32) if reward_type == 'sparse' else reward
 
 
@@ -261,7 +264,7 @@ class RobotEnv(FetchHandEnv, GoalEnv):
         self._state(**{name: state[name] for name in state['_stated']})
 
     def _render_callback(self) -> None:
-        """Write the goal into `model` and `data`, if the user has read one of them."""
+        """Move the goal markers in `model` and `data`, once the user has read one of the two."""
         if self._physics.is_shared:
             self._show_goal()
             self._keep_goal()
@@ -298,7 +301,7 @@ class FetchEnv(RobotEnv):
         target_in_the_air: Whether goals may be above the table.
         target_offset: Added to goals: (3,) m, or the number 0 if there is no offset.
         obj_range: Half width of the square in which the object starts, m.
-        target_range: Half width of the cube in which goals lie, m.
+        target_range: Half width of the square (FetchReach: cube) in which goals lie, m.
     """
 
     def __init__(self, task: str, **arguments: Any) -> None:
@@ -414,7 +417,7 @@ class ManipulateEnv(RobotEnv):
         mujoco_utils().set_joint_qvel(self.model, self.data, 'target:joint', np.zeros(6))
 
     def _shown_goal(self) -> Array:
-        """Return the goal pose (7,) to draw, beside the hand if its position does not count."""
+        """Return the goal pose (7,) to draw, beside the hand if the task ignores goal positions."""
         goal = self.goal.copy()
         if not self.spec_of_task.position_counts:
             goal[0] += 0.15
@@ -451,7 +454,10 @@ def _goal_kind(task: str) -> tuple[str, str]:
 
 
 def task_with_goals(task: str, position: str | None, rotation: str | None) -> str:
-    """Return the task with the object of `task` and these goals; None means as in `task`."""
+    """Return the task with the object of `task` and goals of this position and rotation kind.
+
+    None keeps the kind of `task`. A combination without a task raises ValueError.
+    """
     one_of(task, list(MANIPULATE_CONFIGS), 'task')
     own, asset = _goal_kind(task), MANIPULATE_CONFIGS[task].asset
     wanted = (position or own[0], rotation or own[1])

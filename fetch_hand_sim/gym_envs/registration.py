@@ -94,7 +94,10 @@ def _id_of(name: str | EnvSpec) -> str | EnvSpec:
 
 
 def _with_length(name: str | EnvSpec, arguments: dict[str, Any]) -> dict[str, Any]:
-    """Add `max_episode_steps` for the episode's duration, unless the arguments contain it."""
+    """Return the arguments with `max_episode_steps` for the task's duration at `control_hz`.
+
+    Arguments with `max_episode_steps`, or without `control_hz`, are returned unchanged.
+    """
     rate = arguments.get('control_hz')
     if rate is None or arguments.get('max_episode_steps') is not None:
         return arguments

@@ -92,7 +92,11 @@ class FetchHandVecEnv(VecEnv):
         return [values[i] for i in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """Set `goal` of the environments in `indices`, or an attribute that all share."""
+        """Set `goal` of the environments in `indices`, or an attribute that all environments share.
+
+        Shared are `reward_type`, `distance_threshold` and `rotation_threshold`. A new value for
+        only some of the environments raises ValueError.
+        """
         values = list(self.batch.attributes(attr_name))
         for index in self._get_indices(indices):
             values[index] = value
@@ -105,7 +109,7 @@ class FetchHandVecEnv(VecEnv):
         indices: VecEnvIndices = None,
         **method_kwargs: Any,
     ) -> list[Any]:
-        """Call a method of the environments; return the result of each one in `indices`."""
+        """Call a method once for all N environments; return one result for each in `indices`."""
         results = self.batch.call(method_name, *method_args, **method_kwargs)
         return [results[i] for i in self._get_indices(indices)]
 

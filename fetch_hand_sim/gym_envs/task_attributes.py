@@ -104,7 +104,7 @@ class TaskAttributes:
             self.rotation_threshold = rotation_threshold
 
     def __setattr__(self, name: str, value: Any) -> None:
-        """Set an attribute; reject methods of other environments that this one never calls."""
+        """Set an attribute; TypeError for a Gymnasium-Robotics method that this class ignores."""
         if name in self._uncalled:
             raise TypeError(f'{name} would have no effect here; {self._hint}')
         super().__setattr__(name, value)
@@ -213,7 +213,8 @@ class TaskAttributes:
 
         Args:
             options: A dictionary or None. Each option is one value for all, or a list of N.
-            mask: (N,) True for the environments that start; the results contain only these.
+            mask: (N,) True for the environments that start. Each returned list has one entry for
+                each of these.
             others: Names of further allowed options, which the caller reads.
         """
         given = entries('options', {} if options is None else options, (*RESET_OPTIONS, *others))
@@ -240,6 +241,6 @@ def action_space(spec: TaskSpec) -> spaces.Space[Any]:
 def clip_actions(actions: NDArray[Any]) -> NDArray[Any]:
     """Clip actions to [-1, 1] as Gymnasium-Robotics does; NaN stays and is rejected later.
 
-    The floating type stays, because the Fetch tasks scale actions in it.
+    The dtype stays, because the Fetch tasks scale actions in the precision of the given dtype.
     """
     return np.clip(actions, -1.0, 1.0) if actions.dtype.kind in 'fiu' else actions

@@ -155,8 +155,8 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
             each ended episode, and `final_info`.
 
         Raises:
-            ValueError: If the actions have a wrong shape, a value is NaN, or a subclass ends
-                episodes by anything but (N,) booleans.
+            ValueError: If the actions have a wrong shape, a value is NaN, or an overridden method
+                returns neither a boolean nor (N,) booleans for the end of episodes.
             gymnasium.error.ResetNeeded: If an environment was never reset or, in mode `DISABLED`,
                 its episode has ended.
         """
@@ -220,7 +220,7 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
     def _start_next(
         self, last: Observation, info: dict[str, Any], ended: Flags
     ) -> tuple[Observation, dict[str, Any]]:
-        """Start the next episodes; return their observation, and info with `final_obs`."""
+        """Reset `ended` (N,) environments; return N observations and `info` with `final_obs`."""
         final = np.full(self.num_envs, None, dtype=object)
         for index in np.flatnonzero(ended).tolist():
             final[index] = {name: rows[index] for name, rows in last.items()}
@@ -247,7 +247,7 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
 
     @property
     def np_random_seed(self) -> tuple[int, ...]:  # type: ignore[override]
-        """The seeds of the N random generators; -1 where none was given."""
+        """The seeds of the N random generators, given or drawn; -1 while a generator has none."""
         return tuple(-1 if seed is None else seed for seed in self._seeds)
 
     def render(self) -> tuple[Any, ...] | None:
@@ -325,7 +325,7 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
         self._pictures.close()
 
     def _each_seed(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
-        """Return a seed for each environment; None continues the random generator."""
+        """Return N seeds, drawn for environments that never had one; None continues a generator."""
         if seed is None:
             each: list[int | None] = [None] * self.num_envs
         elif np.ndim(seed):  # type: ignore[arg-type]

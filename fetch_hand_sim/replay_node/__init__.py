@@ -1,7 +1,7 @@
-"""`replay_node`: publishes a logged episode on its topics with its timing.
+"""`replay_node`: publishes the messages of a logged episode with the recorded timing.
 
-It has the topics of a robot, so `policy_node` works with a replay, too. Recorded commands are
-published only on request, because they would mix with those of a policy. `schedule.py` computes
+It publishes the topics of `sim_node`, so `policy_node` works with a replay, too. Recorded commands
+are published only on request, because they would mix with those of a policy. `schedule.py` computes
 what to publish when, without ROS; `node.py` is the node.
 """
 

@@ -87,7 +87,7 @@ class ReplayNode(Node):
         return f'{namespace}/{name.removeprefix(recorded)}'
 
     def run(self, stop: StopSignals) -> None:
-        """Publish until the end or a signal; UsageError if another node publishes a topic."""
+        """Publish until the end or a signal; UsageError if a topic has another publisher."""
         loop = EventLoop(self)
         self.get_logger().info(self._description())
         try:

@@ -71,7 +71,7 @@ class ReplaySchedule:
         self.namespace = status.rpartition('/')[0]
 
     def index_at(self, time_ns: int) -> int:
-        """Return the index of the first message at or after a time."""
+        """Return the index of the first message at or after a log time; `len(messages)` if none."""
         return bisect_left(self.messages, time_ns, key=lambda message: message.time_ns)
 
     def latched_at(self, time_ns: int) -> list[ReplayMessage]:

@@ -135,7 +135,7 @@ class GraphWatch:
         return self._subscribers.are_connected()
 
     def waiting_elsewhere(self) -> list[str]:
-        """Return a line for each node that waits for a robot in another, empty namespace."""
+        """Return a line for each node that waits for a robot in a namespace without a robot."""
         return [
             f'{full_name(info.node_namespace, info.node_name)} waits for a robot on {name}'
             for name, _ in self._node.get_topic_names_and_types()

@@ -228,7 +228,7 @@ class Health:
         }
 
     def _log_news(self) -> None:
-        """Log changes of the commanding nodes, and each lasting problem when it begins."""
+        """Log changes of commanding nodes, new lasting problems and the first far-out command."""
         logger, buffer = self._node.get_logger(), self._robot.buffer
         commanders = self._watch.inputs.commanders
         if commanders != self._commanders:

@@ -225,7 +225,7 @@ class SimNode(Node):
             loop.wait(BEAT)
 
     def _serve_until_due(self, loop: EventLoop, stop: StopSignals) -> None:
-        """If a tick is due, serve waiting callbacks and run it; otherwise serve one callback."""
+        """Run a due tick, in real time after waiting callbacks; otherwise serve one callback."""
         remaining = self._robot.wait()
         if remaining > 0.0:
             loop.wait(min(remaining, BEAT))
@@ -259,7 +259,10 @@ class SimNode(Node):
             self._publish(self._health.messages(now))
 
     def _stand_still(self, now: float) -> None:
-        """While no tick runs, publish `/clock` and repeat the last tick for new subscribers."""
+        """Without ticks, repeat the last tick for new subscribers and log a missing command.
+
+        While paused or before the first tick, publish `/clock`, too.
+        """
         robot, watch = self._robot, self._watch
         has_started = robot.runner.has_started
         if robot.schedule.is_paused or not has_started:

@@ -63,7 +63,7 @@ class Robot:
     Attributes:
         counters: Counts since the start.
         perturb_limit: Largest force of a push, N; 0 rejects all pushes.
-        has_commander: Whether the first episode waited for a policy, so that commands are expected.
+        has_commander: Whether the node waited for a policy; then the first step expects a command.
         last_messages: Messages of the last tick, which are repeated for new subscribers.
     """
 
@@ -90,7 +90,7 @@ class Robot:
         self._late_commands = 0
 
     def wait(self) -> float:
-        """Return the seconds until the next tick; infinity while it waits for a command or call."""
+        """Return the seconds until the next tick; infinity if a command or call must come first."""
         now = self._clock()
         has_command = self.buffer.has_fresh_command or not self.runner.has_started
         wait = self.schedule.wait(now, has_command, self.lacks_answer)
@@ -225,10 +225,10 @@ class Robot:
         return Answer(True, f'{ends}; a tick of its own {starts}')
 
     def _silence_begins(self) -> float:
-        """Return the time from which no command for the last tick can arrive any more.
+        """Return the monotonic time, s, at which a requested reset of a waiting robot may run.
 
-        If such a command arrived after the reset, it would be taken as the answer to the reset, and
-        all later commands would be one tick late.
+        By then the command for the last tick has arrived or timed out. A command that arrived after
+        the reset would count as the answer to it, and all later commands would be one tick late.
         """
         is_answered = self.schedule.is_paused or self.buffer.has_fresh_command
         return self._clock() if is_answered else self._ticked_at + _ANSWER_TIME

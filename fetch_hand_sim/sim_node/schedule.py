@@ -71,7 +71,8 @@ class TickSchedule:
     def wait(self, now: float, has_command: bool, lacks_answer: bool = False) -> float:
         """Return the seconds until the next tick; infinity while paused.
 
-        In lockstep it is 0 with a new command (`has_command`), and infinity without one.
+        In lockstep it is 0 with a new command (`has_command`), and infinity without one. In real
+        time, `lacks_answer` (no command for the last tick yet) adds `answer_wait`.
         """
         if self.is_paused or (self.mode == 'lockstep' and not has_command):
             return math.inf
@@ -81,7 +82,10 @@ class TickSchedule:
         return max(0.0, due + (self.answer_wait if lacks_answer else 0.0) - now)
 
     def postpone(self, until: float) -> None:
-        """Move the deadline to `until`, by at most `answer_wait`, after a wait for a command."""
+        """Move the deadline to the time `until` if that is later, but by at most `answer_wait`.
+
+        Call it before `begin` if the tick waited for a command; all later deadlines move, too.
+        """
         self._due = min(max(self._due, until), self._due + self.answer_wait)
 
     def begin(self, now: float) -> None:

@@ -97,7 +97,7 @@ class SimulationInterfaces:
         return _finish(response, ALREADY_IN_TARGET_STATE if is_there else OK, answer.message)
 
     def reset_simulation(self, request: Any, response: Any) -> Any:
-        """End the episode for the scope `state`; start again at the first episode for `all`."""
+        """End the episode; scope `state` starts the next one, scope `all` or default the first."""
         if request.scope not in (SCOPE_DEFAULT, SCOPE_STATE, SCOPE_ALL):
             line = f'scope {request.scope} given; allowed: {SCOPE_STATE} (state), '
             line += f'{SCOPE_DEFAULT} and {SCOPE_ALL} (all but time, which never goes back)'

@@ -50,9 +50,9 @@ def finite_numbers(name: str, values: ArrayLike, *shapes: tuple[int, ...]) -> ND
 
 
 def nearest_quaternions(goals: Array, achieved_goals: Array) -> Array:
-    """Return goal poses (n, 7) with unit quaternions; of q and -q, the one nearer to the object's.
+    """Return goal poses (n, 7) with unit quaternions in the hemisphere of the achieved goals.
 
-    A zero quaternion raises ValueError.
+    Of q and -q, one is in this hemisphere. A zero goal quaternion raises ValueError.
     """
     norm = np.linalg.norm(goals[:, 3:], axis=1, keepdims=True)
     if not (norm > 1e-6).all():
@@ -63,10 +63,11 @@ def nearest_quaternions(goals: Array, achieved_goals: Array) -> Array:
 
 
 def each_of(name: str, given: Any, count: int) -> list[Any]:
-    """Return a list with a value or None for each of `count` simulations.
+    """Return the argument `name` as a list with one value for each of `count` simulations.
 
     `given` is one value for all simulations, or `count` values: a list, a tuple or the rows of an
-    array. Another number of values raises ValueError. A goal as a list of numbers is one value.
+    array. Values may be None. Another number of values raises ValueError. If `name` is `goal`, a
+    list of numbers is one goal for all simulations.
     """
     is_list = isinstance(given, list | tuple)
     if is_list and name == 'goal':
@@ -79,7 +80,10 @@ def each_of(name: str, given: Any, count: int) -> list[Any]:
 
 
 def selected_simulations(ids: ArrayLike, num_envs: int) -> NDArray[np.intp]:
-    """Return the indices that `ids` selects; ValueError unless distinct indices or a mask (N,)."""
+    """Return the indices of simulations in `ids`: distinct indices or a boolean mask (N,).
+
+    Other values of `ids` raise ValueError. The result keeps the order of the indices.
+    """
     selected = np.asarray(ids)
     if selected.dtype == bool and selected.shape == (num_envs,):
         return np.flatnonzero(selected)
@@ -97,7 +101,7 @@ def selected_simulations(ids: ArrayLike, num_envs: int) -> NDArray[np.intp]:
 
 
 def generators(seed: Seeds, selected: NDArray[np.intp]) -> list[np.random.Generator | None]:
-    """Return a new random generator for each selected simulation; None keeps the old one.
+    """Return the new random generator of each selected simulation; None if it keeps its generator.
 
     `seed` is as in `Simulation.reset`; invalid seeds raise ValueError.
     """

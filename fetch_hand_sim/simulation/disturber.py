@@ -53,7 +53,7 @@ class Disturber:
     the episode, and do not change the draws of start and goal.
 
     Attributes:
-        variations: Values drawn for the running episodes, (N,) each, by the names in `VARIATIONS`.
+        variations: Values of the running episodes, (N,) each, by the names in `VARIATIONS`.
     """
 
     def __init__(self, task: Task, disturbances: Disturbances) -> None:
@@ -237,11 +237,19 @@ class Disturber:
         return disturbed.astype(commands.dtype)
 
     def _chance(self, number: int) -> Array:
-        """Return the uniform random numbers (N,) of this tick for purpose `number`, 0 ... 4."""
+        """Return random numbers (N,) of this tick, uniform in [0, 1), for a kind of random event.
+
+        `number` is the event: 0 lost command, 1 repeated command, 2 push, 3 lost tracking of the
+        object, 4 missing measurement of the object.
+        """
         return np.asarray(self._uniform[self._all, self._tick % _BLOCK, number])
 
     def _error(self, name: str, noise: float | Array) -> Array:
-        """Return the error of signal `name` at this tick, (N, columns): bias plus white noise."""
+        """Return the error of signal `name` at this tick, (N, components): bias plus white noise.
+
+        `name` is `action`, `joint`, `velocity`, `object` or `push`. `noise` is the standard
+        deviation of the white noise: one value, or one for each component.
+        """
         columns = self._columns[name]
         white = self._normal[self._all, self._tick % _BLOCK, columns]
         return np.asarray(noise * white + self._biases[:, columns])
@@ -454,7 +462,10 @@ class VariedPhysics:
             values[ids] = self._nominal[field]
 
     def apply(self, ids: Ids, variations: Mapping[str, Array]) -> bool:
-        """Apply variations (N,) to simulations after `restore`; return whether any is on."""
+        """Vary the physics of simulations `ids` by `variations`, (N,) each; call `restore` first.
+
+        Returns True if at least one variation is switched on.
+        """
         for name in self.names:
             factors, live = variations[name][ids], self._live
             for field, rows in self._rows[name].items():

@@ -1,7 +1,7 @@
 """Find, compile and tune the MJCF models of the installed `gymnasium-robotics` package.
 
-The package only contains the assets. It is never imported, because importing it with MuJoCo >= 3.17
-registers environments that do not start.
+Only the assets of this package are used. The package is never imported, because the import with
+MuJoCo >= 3.17 registers environments that do not start.
 
 Tuning makes a model faster to step; trajectories stay the same, bit for bit. It disables stages
 whose results are unused. It also reduces the pairs of geoms that collision detection tests, with
@@ -137,7 +137,7 @@ def list_geom_pairs(spec: mujoco.MjSpec) -> None:
 
 
 def collision_candidates(model: mujoco.MjModel) -> list[tuple[int, int]]:
-    """Return the pairs of geoms that MuJoCo tests, ascending, except pairs that the model lists."""
+    """Return ascending pairs of geom indices that MuJoCo tests, without the model's `<pair>`s."""
     listed = set(zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True))
     return [
         (first, second)
@@ -162,7 +162,7 @@ def _masks_match(model: mujoco.MjModel, first: int, second: int) -> bool:
 
 
 def _bodies_may_collide(model: mujoco.MjModel, first: int, second: int) -> bool:
-    """Return whether MuJoCo tests the bodies of two geoms for collision.
+    """Return whether the bodies of geoms `first` and `second` allow MuJoCo to test these geoms.
 
     MuJoCo skips bodies that are welded together, that are parent and child (unless the parent is
     the world), or that the model excludes.
@@ -223,9 +223,9 @@ def _share(one: NDArray[Any], other: NDArray[Any]) -> NDArray[Any]:
 
 
 class ListedPairs:
-    """Updates the contact parameters of listed pairs when the parameters of their geoms change.
+    """Updates the parameters of a model's `<pair>` elements when parameters of their geoms change.
 
-    Pairs with parameters of their own in the compiled model are never changed.
+    A pair is never changed if its compiled parameters differ from the mix of its geoms.
     """
 
     def __init__(self, model: mujoco.MjModel) -> None:

@@ -46,9 +46,9 @@ def prepare_opengl() -> str:
 
 @contextlib.contextmanager
 def context_of_its_own() -> Iterator[None]:
-    """Restore the OpenGL context of this thread after the block, which may use another one.
+    """Run a block that may use another EGL context, then restore the context of this thread.
 
-    With EGL, other threads may then use the context of the block.
+    Afterwards other threads can use the block's context. With GLFW and OSMesa nothing is restored.
     """
     before = _current_of_egl()
     try:
@@ -65,7 +65,7 @@ def context_of_its_own() -> Iterator[None]:
 
 
 def _current_of_egl() -> tuple[Any, ...] | None:
-    """Return the arguments with which `eglMakeCurrent` restores this thread's context, or None."""
+    """Return arguments of `eglMakeCurrent` that restore this thread's context; None without one."""
     egl = sys.modules.get('mujoco.egl')
     if egl is None or egl.EGL_DISPLAY is None or not (context := egl.EGL.eglGetCurrentContext()):
         return None

@@ -93,7 +93,7 @@ class SceneRenderer:
 
     @contextlib.contextmanager
     def _in_its_thread(self) -> Iterator[None]:
-        """Replace errors of the block by a one-line RuntimeError if another thread owns OpenGL."""
+        """Replace errors by a one-line RuntimeError if another thread created the renderer."""
         try:
             with context_of_its_own():
                 yield

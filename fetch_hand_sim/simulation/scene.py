@@ -229,7 +229,7 @@ class Scene:
 
 
 def ghost_pose(spec: TaskSpec, goal: Array) -> Array:
-    """Return the pose (7,) in which to draw the ghost of a pose goal (7,)."""
+    """Return the ghost's pose (7,): the goal (7,), moved aside if the task counts only rotation."""
     pose = np.array(goal)
     if not spec.position_counts:
         pose[:3] += GHOST_OFFSET

@@ -300,8 +300,8 @@ class Simulation:
         """Advance every simulation by one step, with commands in ROS units; see `step`.
 
         Args:
-            commands: (N, action size), clipped to the limits (`msgs_spec.robots.clip_command`).
-                Fetch: as actions. Hand: absolute joint positions in radians.
+            commands: (N, action size), already clipped by `msgs_spec.robots.clip_command`; this
+                method does not clip. Fetch: as actions. Hand: absolute joint positions in radians.
         """
         return self._result(self.advance(commands))
 
@@ -381,7 +381,7 @@ class Simulation:
         return self._disturber is not None and self._disturber.varies_physics
 
     def variation(self, index: int) -> dict[str, float]:
-        """Return the values, by name, that disturbances drew for the running episode; {} if off."""
+        """Return the variations of the running episode, drawn or given; {} without disturbances."""
         index = self._index(index)
         if self._disturber is None:
             return {}

@@ -79,7 +79,7 @@ def _specification(spec: TaskSpec) -> Rules:
 
 
 def _model(task: Task) -> Rules:
-    """Check that the object has a free joint, and that pictures show the simulated model."""
+    """Yield (condition, error): an object has a free joint; pictures show the simulated model."""
     name = task.spec.object_name
     yield (
         name is None or task.object_qpos is not None,
@@ -109,7 +109,10 @@ def _sensors(task: Task) -> Rules:
 
 
 def _formulas(task: Task) -> Rules:
-    """Check that formulas accept any leading axes and compute each row from that row alone."""
+    """Yield (condition, error) pairs about the formulas of observation and achieved goal.
+
+    The formulas must accept readings with any leading axes, and compute each row independently.
+    """
     spec = task.spec
     rows = task.readings(spec.observed_topics)
     for topic in sensor_topics(spec):
@@ -147,7 +150,7 @@ def _rewards(simulation: Simulation) -> Rules:
 
 
 def _resets(simulation: Simulation) -> Rules:
-    """Check that equal seeds give equal episodes, and that a reset changes no other simulation."""
+    """Yield (condition, error): equal seeds repeat episodes; resets change no other simulation."""
     size = simulation.spec.robot.action_size
     simulation.reset(seed=[0, 1])
     first = _all_sensors(simulation)

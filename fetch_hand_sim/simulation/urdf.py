@@ -106,7 +106,7 @@ class RobotDescription:
 
         Args:
             frame_prefix: Prefix of all links except the root, such as `left/`.
-            joint_prefix: Prefix of the joint names in `joint_states`.
+            joint_prefix: Replaces `robot0:` in the joint names of the URDF, as in `joint_states`.
         """
         robot = ElementTree.Element('robot', name=self._spec.robot.name)
         ElementTree.SubElement(robot, 'link', name=ROOT)

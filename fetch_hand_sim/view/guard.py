@@ -66,7 +66,7 @@ class Attendance:
 
     @property
     def is_there(self) -> bool:
-        """True if the page in control has sent input within the last 3 s."""
+        """True if the page in control is connected and has sent input within the last 3 s."""
         return self._clock() - self._heard < _SILENCE
 
     def note(self) -> None:
@@ -79,14 +79,14 @@ class Attendance:
         self._visits += 1
 
     def has_left(self) -> bool:
-        """Return whether the page in control is unused, or was closed since the last call."""
+        """True if the page in control sent no input for 3 s or disconnected since the last call."""
         visits, before = self._visits, self._known_visits
         self._known_visits = visits
         return visits != before or not self.is_there
 
 
 def is_loopback(host: str) -> bool:
-    """Return whether a host is `localhost` or a loopback address, reachable only from here."""
+    """Return whether only this machine reaches a host: `localhost` or a loopback address."""
     try:
         return host == 'localhost' or ip_address(host).is_loopback
     except ValueError:
@@ -97,13 +97,13 @@ def is_loopback(host: str) -> bool:
 class Guard:
     """Accepts or rejects requests to the page.
 
-    Without a token, the Host header must be `localhost` or a loopback address, not another name
-    that resolves to it. With a token, every request needs the token. Only the page itself may open
-    a web socket.
+    Without a token, the Host header must be `localhost` or a loopback address; other names are
+    rejected. With a token, every request needs the token in its address or cookie. Web sockets need
+    the Origin of the page.
 
     Args:
         token: Secret that visitors need; None if only this machine can connect.
-        port: Port of the page, which is part of the cookie's name.
+        port: Port of the page; it is part of the name of the cookie that stores the token.
     """
 
     def __init__(self, token: str | None = None, port: int = 0) -> None:
@@ -131,7 +131,7 @@ class Guard:
         return None
 
     def admission(self, target: str) -> str | None:
-        """Return the cookie for a visitor whose `target` contains the token, else None."""
+        """Return the `Set-Cookie` header if the address `target` contains the token, else None."""
         if self.token is None or not self._matches(_tokens_in(target)):
             return None
         # Strict cookies are not sent after a link on another site. Only web sockets can command,
@@ -218,7 +218,10 @@ def guarded_serve(
 
 
 def _adapt(response: Response, is_read_only: bool) -> None:
-    """Add language and viewport to the page; in read-only mode, show the role `Watching`."""
+    """Add language and viewport tag to an HTML response, in place.
+
+    In read-only mode, replace the text `Controlling` in the viewer's program by `Watching`.
+    """
     content = response.headers.get('Content-Type', '')
     body = bytes(response.body or b'')
     if content.startswith('text/html'):
@@ -230,7 +233,7 @@ def _adapt(response: Response, is_read_only: bool) -> None:
 
 
 def _attended(handler: Any, attendance: Attendance) -> Callable[[Any], Awaitable[None]]:
-    """Wrap a handler of web sockets so that `attendance` records input and disconnection."""
+    """Wrap a web socket handler; `attendance` then records input and end of the page in control."""
 
     async def handle(connection: Any) -> None:
         # A browser that hangs does not confirm the end, and the next visitor would wait for it.

@@ -55,7 +55,7 @@ class LiveRobot:
 
     Args:
         node: The node of this process.
-        may_command: Whether the page may act, not only watch.
+        may_command: False for a page that can only watch (`--read-only`).
     """
 
     def __init__(self, node: Node, may_command: bool) -> None:
@@ -89,7 +89,7 @@ class LiveRobot:
 
     @property
     def picture_period(self) -> float:
-        """Seconds between two pictures; longer if the robot is faster than real time."""
+        """Seconds between two frames without input: 1/12 above 1.5 times real time, else 1/30."""
         status = self._watch.status
         is_fast = status is not None and self._facts.rate > _HURRY * status.control_hz
         return OVERLOOKING if is_fast else FOLLOWING
@@ -168,9 +168,9 @@ class LiveRobot:
         self._update_facts(phase=status.phase, episode=status.episode, seed=status.seed)
 
     def _history_for(self, spec: TaskSpec, status: EpisodeStatus) -> History:
-        """Return the history for a status; a new one if the task differs or the robot waits.
+        """Return the history for a status: a new one for another task or the phase `waiting`.
 
-        Another success rule begins new curves.
+        If only the success rule has changed, keep the history, but begin new curves.
         """
         known, rule = self._history, status.success_rule
         # A waiting robot has no episode yet.
@@ -210,7 +210,7 @@ class LiveRobot:
             self._update_facts(is_silent=False)
 
     def _look(self) -> None:
-        """Check the ROS graph for another robot or a replay; request settings that may be new."""
+        """Check for another robot, a replay or silence; read speed and actor if they may be new."""
         self._notice_other_robot()
         is_other = self._replays.look()
         replay = self._replays.replay
@@ -233,14 +233,14 @@ class LiveRobot:
             self._requests.read_actor()
 
     def _end_notice(self) -> None:
-        """Remove the notice on the page after its episode, but not before it was shown for 3 s."""
+        """Remove the notice when it is older than 3 s and another episode has begun since then."""
         episode, since = self._noticed
         is_over = episode != (self._facts.episode, self._facts.seed)
         if self._facts.notice and is_over and time.monotonic() - since > _NOTICE_TIME:
             self._update_facts(notice='')
 
     def _follow_replay(self, name: str) -> None:
-        """Set the facts for the replay node `name`, which publishes no diagnostics."""
+        """Update the `Facts` for the replay node `name`, which publishes no diagnostics."""
         self._hear()
         self._asked_rate = None
         self._unread.add('speed')

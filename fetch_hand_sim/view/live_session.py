@@ -99,7 +99,14 @@ def _nodes(
     loop: EventLoop,
     stop: StopSignals,
 ) -> Iterator[Nodes]:
-    """Wait for a robot, or start one with a policy; yield the started nodes and stop them later."""
+    """Wait for a robot, or start one with a policy; yield the started processes by node name.
+
+    The mapping is empty if a robot already runs. The end of the context stops the processes.
+
+    Raises:
+        NodeFailure: If no fitting robot is found, or a started process has ended.
+        UsageError: If options are given that only a new robot could use.
+    """
     end = time.monotonic() + (DISCOVERY_TIME if options.task else options.wait)
     while robot.spec is None and not stop and time.monotonic() < end:
         loop.wait(_FRAME_TIME)

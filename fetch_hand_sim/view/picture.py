@@ -1,6 +1,6 @@
 """Messages from the source (a running robot or a file player) to the page.
 
-The viewer delivers every event, but only the newest snapshot (`mujoco.studio.messages`).
+MuJoCo's viewer delivers each `Event`, but of each `Snapshot` class only the newest message.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class Facts:
         rate: Measured ticks per second; 0 if unknown.
         missed_ticks: Number of missed ticks since the robot started.
         push_limit: Largest force of a push, N; 0 if the robot accepts none.
-        may_command: Whether this page can act at all.
+        may_command: False for a page that can only watch (`--read-only`).
         actors: Actors to choose from; empty without a policy node.
         actor: Name or file of the active actor, or '' if unknown.
         is_replay: Whether a replay node publishes instead of a robot.
@@ -83,8 +83,9 @@ class Graphs:
         distance: Distance to the goal, m.
         rotation: Rotation to the goal, rad, 0 ... pi.
         commands: Values (ticks, action size), command units.
-        positions: Values (ticks, action size) of the joints that the commands drive. The gripper is
-            -1 (closed) to 1 (open). Commands that move the gripper along an axis have NaN.
+        positions: Values (ticks, action size) of the joints that the commands drive, rad. The
+            fingers of the Fetch are -1 (closed) to 1 (open). Commands that move the gripper along
+            an axis have NaN.
     """
 
     distance: Series | None = None
@@ -119,7 +120,7 @@ class Picture(messages.Snapshot):
         task: Name of the task.
         frame: State of robot, object and goals; None before the first tick.
         stamp_ns: Simulated time of the frame, nanoseconds.
-        trail: Earlier positions (3,) of the object or gripper.
+        trail: Last positions (3,) of the object or gripper, the newest at the end.
         command: The last applied command (action size,); None at a reset.
         timeline: Position in the file; None for a running robot.
     """

@@ -1,6 +1,6 @@
 """User requests, which the page sends to its source (a running robot or a file player).
 
-The viewer delivers every event, but only the newest snapshot (`mujoco.studio.messages`).
+MuJoCo's viewer delivers each `Event`, but of each `Snapshot` class only the newest message.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class StepOnce(Request, messages.Event):
 
 @dataclass(frozen=True)
 class Reset(Request, messages.Event):
-    """Ends the episode; the next one uses `seed`, or for None the next seed of the series."""
+    """Ends the episode; the next one uses `seed`, or the robot's next seed if `seed` is None."""
 
     seed: int | None = None
 
@@ -82,7 +82,7 @@ class ReleaseGoal(Request, messages.Event):
 class Push(Request, messages.Snapshot):
     """Pushes a body with a wrench (6,), N and N m, as long as the request is repeated.
 
-    The wrench acts at the centre of mass, along the world axes. It is scaled down to the limit.
+    The wrench acts at the centre of mass, along the world axes; `Facts.push_limit` limits it.
     """
 
     body: str

@@ -49,7 +49,7 @@ class RemoteNode:
     Args:
         node: The node of this process.
         name: Name of the other node, fully qualified or relative to the namespace of `node`.
-        notice: Called with one line about the result of a call.
+        notice: Called with a line for the user, for example if a call is rejected.
     """
 
     def __init__(self, node: Node, name: str, notice: Callable[[str], None]) -> None:
@@ -80,7 +80,7 @@ class RemoteNode:
         self._call(service, type_name, fields, answered)
 
     def get_parameter(self, name: str, then: Callable[[Any], None]) -> None:
-        """Request a parameter; call `then` with its value when the node answers."""
+        """Request a parameter; call `then` with its value if the node exists and answers."""
         from rclpy.parameter import parameter_value_to_python
 
         def answered(future: Any) -> None:
@@ -173,7 +173,7 @@ class RobotRequests:
         return self._policy.is_there()
 
     def take_task(self, spec: TaskSpec) -> None:
-        """Set the task of the robot; if it differs, drop the user's goal and stop commanding."""
+        """Store the robot's task; if it has changed, drop the user's goal and stop commanding."""
         if self._spec is not None and self._spec.name != spec.name:
             self.forget_goal()
             # Goals of another task may have another type.
@@ -257,7 +257,7 @@ class RobotRequests:
                 self._time.set_parameter(name, factor, taken)
 
     def fits(self, request: Request) -> bool:
-        """Return whether a goal or command has the size that the current robot needs."""
+        """Return whether a goal or command has the robot's size; True for other requests."""
         if self._spec is None or not isinstance(request, SetGoal | SetCommand):
             return True
         name = 'set_goal' if isinstance(request, SetGoal) else 'commands'
@@ -318,7 +318,7 @@ class RobotRequests:
         self._publishers[name].publish(data)
 
     def _withdraw(self, name: str) -> None:
-        """Destroy the publisher of topic `name`; otherwise this node would count as a commander."""
+        """Destroy the publisher of topic `name`; publishers of `commands` count as commanders."""
         publisher = self._publishers.pop(name, None)
         if publisher is not None:
             self._node.destroy_publisher(publisher)

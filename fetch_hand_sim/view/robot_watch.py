@@ -1,6 +1,6 @@
 """Follow a robot or a replay over its topics; assemble each tick from its messages.
 
-Subscriptions are best effort, so the robot need not resend messages to a viewer that hangs.
+Subscriptions are best effort: a slow viewer loses messages, and the robot does not resend them.
 """
 
 from __future__ import annotations
@@ -53,9 +53,9 @@ class SeenTick:
     Attributes:
         stamp_ns: Simulated time, nanoseconds.
         frame: State of robot, object and goals.
-        reward: None at a reset.
-        command: (action size,) applied command; None at a reset.
-        status: Status of the episode at this tick; None unless `latest_tick` contains it.
+        reward: None at a reset, or if its message was lost.
+        command: (action size,) applied command; None at a reset, or if its message was lost.
+        status: Status of the episode at this tick; None if the tick is not from `latest_tick`.
     """
 
     stamp_ns: int
@@ -70,10 +70,10 @@ class RobotWatch:
 
     Args:
         node: The node of this process.
-        on_status: Called with each status; another robot may have replaced the last one.
+        on_status: Called with each valid status; its task may differ from the last one.
         on_tick: Called with each tick.
-        every_tick: Whether each tick is needed. If not, the topic `latest_tick` is used if it
-            exists; replays do not publish it.
+        every_tick: Whether each tick is needed. If not, ticks come from the topic `latest_tick`
+            if it has a publisher; replays do not publish it.
 
     Attributes:
         status: The latest status; None before the first.
@@ -111,11 +111,11 @@ class RobotWatch:
 
     @property
     def joint_prefix(self) -> str:
-        """The prefix of the robot's joint names."""
+        """The prefix of the robot's joint names; the default prefix before the first status."""
         return self.status.joint_prefix if self.status else JOINT_PREFIX
 
     def _on_status_message(self, message: Any) -> None:
-        """Handle a message of `episode_status`, unless `latest_tick` contains the same status."""
+        """Handle an `episode_status` message; skip it if `latest_tick` delivers the status, too."""
         try:
             status = _read_status(message)
         except ValueError:
@@ -124,7 +124,7 @@ class RobotWatch:
             self._take_status(status)
 
     def _is_other(self, status: EpisodeStatus) -> bool:
-        """Return whether a status comes from another robot than the last status."""
+        """Return whether task, rate or joint prefix have changed; True for the first status."""
         return self.status is None or not self.status.is_of_same_robot(status)
 
     def _take_status(self, status: EpisodeStatus) -> None:
@@ -213,7 +213,7 @@ class RobotWatch:
         return collect
 
     def _finish_tick(self, status: EpisodeStatus | None = None) -> None:
-        """Call `on_tick` if all messages of the tick have arrived."""
+        """Call `on_tick` if joints, goals and success have arrived; other values may be missing."""
         values, spec = self._values, self.spec
         if spec is None or any(name not in values for name in _NEEDED):
             return
@@ -286,10 +286,12 @@ class ReplayWatch:
         return found != before
 
     def stands_still(self, is_paused: bool) -> bool:
-        """Return whether a replay is still paused; another client may have resumed it.
+        """Return whether a replay is paused; ticks during a pause mean that it was resumed.
+
+        Call it periodically. The first two calls of a pause ignore ticks, which may be older.
 
         Args:
-            is_paused: Whether the replay was paused at the last call.
+            is_paused: Whether the replay is believed to be paused.
         """
         moved, self._moved = self._moved, False
         self._paused_looks = self._paused_looks + 1 if is_paused else 0

@@ -28,7 +28,7 @@ _DROPPED = (
 class Requests(plugin.SimPlugin):
     """A viewer plugin that calls `perform` with each request of the page.
 
-    It converts forces of MuJoCo's mouse perturbation to `Push` requests.
+    A body that the mouse pulls (a perturbation of MuJoCo) becomes a `Push` request.
     """
 
     def __init__(self, perform: Perform) -> None:
@@ -64,7 +64,7 @@ class Session:
         self._scene: Scene | None = None
 
     def update(self) -> bool:
-        """Show a new picture, if any, and pass on requests; return whether there was one.
+        """Show the new picture, if any, and pass on requests; return whether a picture was shown.
 
         Raises:
             Exception: The error that ended the thread of the viewer.

@@ -52,7 +52,7 @@ _SET_TIMER_SLACK, _SLACK_NS = 29, 5_000_000
 
 @dataclass(frozen=True, slots=True)
 class Address:
-    """Address of the page; without a `token`, only this machine can connect."""
+    """Interface and port of the page; if `token` is None, only this machine can connect."""
 
     host: str
     port: int
@@ -61,7 +61,7 @@ class Address:
 
     @property
     def url(self) -> str:
-        """The address to open in a browser."""
+        """The address to open in a browser, with the token."""
         host = _outside_host() if self.host in _EVERYWHERE else self.host
         host = f'[{host}]' if ':' in host else host
         query = f'?token={self.token}' if self.token else ''
@@ -81,7 +81,7 @@ class Address:
 
 @dataclass(frozen=True, slots=True)
 class Touch:
-    """State of the user's input (mouse position, wheel, buttons, typing) in one frame."""
+    """Input in one frame: mouse (pixels), wheel movement, any button held, any text field used."""
 
     mouse: tuple[float, float] = (0.0, 0.0)
     wheel: float = 0.0
@@ -92,10 +92,11 @@ class Touch:
 class FrameRate:
     """Decides when the next frame begins. Times are seconds of one steady clock.
 
-    Without input, frames are rare, because drawing takes CPU time from the robot.
+    Until 0.5 s after the last input, frames come as fast as possible. Without input they are rare,
+    because drawing takes CPU time from the robot.
 
     Args:
-        period: Returns the seconds between two frames while the page receives no input.
+        period: Returns the seconds between two frames without input.
     """
 
     def __init__(self, period: Callable[[], float] = lambda: FOLLOWING) -> None:
@@ -180,7 +181,8 @@ def open_page(
         is_read_only: Whether the page can only watch.
 
     Raises:
-        CommandError: If the port is taken, or the host is no address of this machine.
+        CommandError: If the port is taken, the host is no address of this machine, or the server
+            does not answer or does not use the guard.
     """
     listening = _listen(host, port)
     port = listening.getsockname()[1]
@@ -229,13 +231,13 @@ def _wake_seldom() -> None:
 
 
 def is_no_farewell(record: logging.LogRecord) -> bool:
-    """Filter for log records; return False if the error is only a closed connection."""
+    """Filter for log records: return False to hide the error of a closed connection."""
     error = record.exc_info[1] if record.exc_info else None
     return not isinstance(error, ConnectionClosed)
 
 
 def _listen(host: str, port: int) -> socket.socket:
-    """Return a listening socket on `port`, or on the first free port for 0.
+    """Return a listening socket on `port`; 0 takes the first free one of 8080 ... 8099.
 
     Raises:
         CommandError: If the host is no address of this machine, or no port is free.

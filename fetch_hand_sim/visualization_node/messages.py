@@ -171,7 +171,7 @@ class Scalars:
 
 
 class Camera:
-    """Draws pictures of a scene, `width` x `height` pixels, at most `hz` per second; 0 for none."""
+    """Draws `width` x `height` pictures of a scene, at most `hz` per second; none if `hz` is 0."""
 
     def __init__(self, width: int, height: int, hz: float, clock: Callable[[], float]) -> None:
         self.width, self.height = width, height
@@ -185,7 +185,7 @@ class Camera:
 
     @property
     def is_due(self) -> bool:
-        """True if it is time for the next picture."""
+        """True if the caller should render now; False if the last picture is too recent."""
         return np.isfinite(self._period) and self._clock() >= self._due
 
     def render(self, scene: Scene, frame: Frame) -> Picture:
@@ -200,7 +200,7 @@ class Camera:
         return picture
 
     def problem(self) -> str:
-        """Return a line if drawing is too slow for the requested rate, else ''."""
+        """Return a warning if drawing is too slow for the requested rate, else ''."""
         seconds = self.picture_time.median()
         if seconds <= self._period:
             return ''

@@ -103,7 +103,7 @@ class VisualizationNode(Node):
             loop.close()
 
     def _open(self, source: TopicSpec) -> None:
-        """Open a topic; warn if its message package is not installed, as tf2_msgs without ROS."""
+        """Open a publisher; warn if the message package is missing: only ROS has tf2_msgs."""
         try:
             self._outputs[source.name] = open_publisher(self, source)
         except ImportError:

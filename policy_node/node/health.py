@@ -37,7 +37,7 @@ class Pace:
 
 
 def read_pace(message: Any, namespace: str) -> Pace | None:
-    """Return the pace of the robot in a namespace; None if a `/diagnostics` message has none."""
+    """Return the pace of the robot in `namespace` from `/diagnostics`; None if it is missing."""
     for status in message.status:
         if status.name.rpartition('/')[0] == namespace.rstrip('/'):
             values = {pair.key: pair.value for pair in status.values}
@@ -95,7 +95,7 @@ class Health:
             pace: Pace of the robot; None means real time.
             elsewhere: Namespaces of other robots; reported if this namespace has none.
             missing: Required topics without a publisher.
-            publishers: Number of publishers by topic.
+            publishers: Number of publishers of each state topic, by name.
         """
         turns_back = 0
         if self._responder is None:
@@ -125,7 +125,7 @@ class Health:
         return report
 
     def _grown(self, responder: Responder) -> dict[str, int]:
-        """Return how much each counter has grown since the last report, by name."""
+        """Return how much each counter of a responder has grown since the last report, by name."""
         counters = {name: getattr(responder, name) for name in _COUNTERS}
         counters['dropped'] = responder.join.dropped
         return {name: round(self._increases[name].since(n)) for name, n in counters.items()}

@@ -110,7 +110,7 @@ class PolicyNode(Node):
         responder.send_unsent()
 
     def _load_ahead(self) -> LoadedPolicy | None:
-        """Load the policy at the start, so that errors show early; None if its task is unknown."""
+        """Load the policy at the start, to show errors early; None if it needs a robot's task."""
         settings = self._settings
         try:
             return load_policy(
@@ -122,7 +122,13 @@ class PolicyNode(Node):
             raise UsageError(str(error)) from None
 
     def _start(self, status: EpisodeStatus, loop: EventLoop, stop: StopSignals) -> None:
-        """Subscribe to the state of the robot, wait for its publishers and open `commands`."""
+        """Subscribe to the state of the robot, wait for its publishers and open `commands`.
+
+        Return without `commands` if `stop` is set, or the robot or policy changes meanwhile.
+
+        Raises:
+            NodeFailure: If no policy is found, or the policy does not fit the robot.
+        """
         try:
             policy = self._loaded = self._load_for(status)
             responder = Responder(policy, status, self._send)
@@ -152,7 +158,7 @@ class PolicyNode(Node):
         """Return the loaded policy if it has the task of the robot, else load one for this task.
 
         Raises:
-            ValueError: If no policy is found, or it does not fit the robot.
+            ValueError: If no policy for this task is found, or parameter `task` is another one.
         """
         wanted, name = self._settings['task'], self._settings['policy']
         if wanted and wanted != status.task:
@@ -166,7 +172,7 @@ class PolicyNode(Node):
         return before is not None and now is not None and not now.is_of_same_robot(before)
 
     def _take_policy(self, parameters: list[Parameter]) -> SetParametersResult:
-        """Load a new `policy` before its parameter changes; a failure rejects the request."""
+        """Check a change of parameters: load a new `policy`, or reject the change if that fails."""
         result = set_callback(POLICY_NODE)(parameters)
         for parameter in parameters:
             if parameter.name != 'policy' or not result.successful:
@@ -181,9 +187,10 @@ class PolicyNode(Node):
         return result
 
     def _load_for_one(self, name: str) -> tuple[LoadedPolicy | None, EpisodeStatus | None]:
-        """Load a policy; return it and the last status of the robot that it fits.
+        """Load the policy `name`; return the policy and the last status of a robot that it fits.
 
-        None replaces the policy if its task is not known yet, and the status if no robot is known.
+        The policy is None if its task is unknown until a robot appears. The status is None if
+        no robot is known.
 
         Raises:
             ValueError: If the policy cannot be loaded, or fits no robot.
@@ -227,7 +234,7 @@ class PolicyNode(Node):
         self._health.stop()
 
     def _announce(self, policy: LoadedPolicy) -> None:
-        """Publish name and hash of the policy for the robot's log, with the robot's last stamp."""
+        """Publish name and hash of the policy, which the robot logs, with the last status stamp."""
         status = topic(task_spec(policy.task), 'policy_status')
         values = {'commander': policy.description, 'checkpoint_sha256': policy.sha256}
         message = build_status(status, self._status_stamp, NODE_NAME, values)
@@ -236,7 +243,7 @@ class PolicyNode(Node):
         publisher.publish(serialize(status.type_name, message))
 
     def _reader(self, spec: TopicSpec, callback: Callable[[Any], None]) -> Callable[[bytes], None]:
-        """Return a callback that decodes raw messages for `callback` and warns of invalid ones."""
+        """Return a callback that decodes raw messages for `callback`; it drops invalid ones."""
 
         def on_message(data: bytes) -> None:
             try:
@@ -290,9 +297,10 @@ class PolicyNode(Node):
             self._responder.note_phase(status.phase, stamp)
 
     def _may_follow(self, status: EpisodeStatus) -> bool:
-        """Return whether the node accepts a status: from its robot, a successor, or one that fits.
+        """Return whether to follow the robot that published `status`.
 
-        A second robot that the policy does not fit is ignored.
+        True for the present robot, for a robot that replaced it, and for a second robot that the
+        policy fits.
         """
         known = self._status
         if known is None or status.is_of_same_robot(known):

@@ -82,9 +82,10 @@ class StampJoin:
         self._pending.clear()
 
     def _is_late(self, delay: int) -> bool:
-        """Return whether a message `delay` ns older than the last complete stamp is late.
+        """Return whether to drop a message that is `delay` ns older than the last complete stamp.
 
-        A message that is not late is new, or the simulation was started again.
+        Drop it at delay 0, and up to 1 s if that stamp was completed less than 1 s ago. Keep it if
+        it is newer, or older than 1 s: the simulation was started again.
         """
         if not 0 < delay <= _LONGEST_DELAY:
             return delay == 0
@@ -112,7 +113,7 @@ class Responder:
 
     Args:
         policy: The policy.
-        status: The robot's last `episode_status`.
+        status: An `episode_status` of the robot, for its task, joint names and frequency.
         send: Publishes the CDR bytes of a command; returns False without a subscriber.
         clock: A steady clock, seconds.
 
@@ -126,7 +127,7 @@ class Responder:
         unusable: Number of invalid messages, and of ticks without a valid observation.
         failed: Number of observations for which the policy failed.
         last_failure: Error of the last failure.
-        inference: Wall-clock time from a complete observation to its command.
+        inference: Durations of the policy's calls, from an observation to its command.
         received_at: Time of the last complete observation, seconds of the clock.
         interval: Seconds between the last two complete observations; infinite before.
 
@@ -177,7 +178,7 @@ class Responder:
         self.interval = math.inf
 
     def receive(self, name: str, data: bytes) -> None:
-        """Take one message, as CDR bytes; the last message of a tick makes the tick due.
+        """Take a CDR message of the topic `name`; after the last one of a tick, `answer` is due.
 
         Raises:
             ValueError: If the message is invalid. It is counted and dropped.
@@ -207,14 +208,14 @@ class Responder:
 
     @property
     def is_due(self) -> bool:
-        """True while a complete tick has no answer."""
+        """True while `answer` has not yet tried the newest tick with messages of all topics."""
         return self._due is not None
 
     def answer(self) -> None:
-        """Answer the tick that is due, if any.
+        """Call the policy for the tick that is due and send its command; return if no tick is due.
 
-        After a failure the policy tries the same tick once a second, until a newer one is complete.
-        Otherwise a robot in lockstep would wait for ever.
+        If the policy failed, later calls try the same tick again, once a second, until a newer tick
+        is due. Otherwise a robot in lockstep would wait for ever.
 
         Raises:
             ValueError: If the policy fails. The failure is counted.
@@ -260,7 +261,7 @@ class Responder:
             raise ValueError(f'no observation: {one_line(error)}') from None
 
     def _command(self, observation: Vectors) -> NDArray[np.float64]:
-        """Return the command for an observation, (action size,), in the units of `commands`."""
+        """Return the policy's action as the values of a message on `commands`, (action size,)."""
         action, self._state = self.policy.predict(observation, self._state)
         command = command_from_action(self._robot, action.astype(np.float64))
         return np.asarray(command, dtype=np.float64)

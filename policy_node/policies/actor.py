@@ -106,7 +106,7 @@ class Actor(nn.Module, NetworkPolicy):
 
     @torch.inference_mode()
     def act(self, seen: NDArray[np.float32], goal: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return actions (..., action_size) for `seen` (..., input_size) and `goal`."""
+        """Return actions (..., action_size) for `seen` (observation, past actions) and `goal`."""
         action: Tensor = self(self.features(self._input(seen), self._input(goal)))
         found: NDArray[np.float32] = action.cpu().numpy()
         return found

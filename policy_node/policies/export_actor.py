@@ -36,7 +36,7 @@ _TRIALS = 100
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Write the file and return the exit code."""
+    """Run the command `fetch_hand_sim export` and return its exit code."""
     parser = CommandParser(prog=_NAME, description=__doc__)
     parser.add_argument('actor', help='name of a shipped actor, or its .safetensors file')
     parser.add_argument('target', type=Path, help='file to write, <name>.onnx')

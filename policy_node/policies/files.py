@@ -51,7 +51,8 @@ def write_file(path: Path, data: bytes) -> None:
     Links, pipes and devices such as `/dev/stdout` are written directly.
 
     Raises:
-        OSError: If writing fails. The error names the file, and no partial file remains.
+        OSError: If writing fails. The error names the file. No partial file remains, except where a
+            link was written directly.
     """
     is_special = path.exists() and not path.is_file() and not path.is_dir()
     if is_special or path.is_symlink():
@@ -90,7 +91,7 @@ def write_files(files: Mapping[Path, bytes]) -> None:
 
 @contextlib.contextmanager
 def _named(path: Path) -> Iterator[None]:
-    """Add the path to an OSError of the block; Python leaves it out if the disk is full."""
+    """Add `path` to an OSError of the `with` block; a full disk gives an error without a path."""
     try:
         yield
     except OSError as error:
@@ -130,7 +131,7 @@ def tensor_bytes(tensors: Mapping[str, ArrayLike], metadata: dict[str, str]) -> 
 
 
 def read_tensors(path: str | Path) -> tuple[dict[str, NDArray[Any]], dict[str, str]]:
-    """Read arrays and metadata.
+    """Return the arrays and the metadata of a safetensors file, by name.
 
     Raises:
         ValueError: If the file cannot be read or is not a safetensors file.

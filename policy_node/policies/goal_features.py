@@ -48,6 +48,8 @@ class RelativeGoal:
     Parts that do not count for the task are zero. So tasks with the same object can share networks.
 
     Attributes:
+        goal: Kind of the goal: a point, fingertips or a pose.
+        start: Index of the achieved goal in the observation.
         position_counts: Whether the position of a pose goal counts.
         ignores_z_rotation: Whether rotations about the object's own z axis do not count.
     """
@@ -67,11 +69,17 @@ class RelativeGoal:
         return concatenate(*normalized, self.difference(*seen))
 
     def goal_position(self, observation_size: int, size: int) -> list[int]:
-        """Return the indices of the network inputs that depend on the position of a pose goal."""
+        """Return the indices of the network inputs that depend on the position of a pose goal.
+
+        `size` is the number of inputs, without past actions.
+        """
         return [*range(observation_size, observation_size + 3), *range(size - 3, size)]
 
     def difference(self, observation: Array, goal: Array) -> Array:
-        """Return goal minus achieved goal: 6 values of a point, 15 of fingertips, 10 of a pose."""
+        """Return the network inputs for the difference between desired and achieved goal.
+
+        The shape is (..., 6) for a point, (..., 15) for fingertips and (..., 10) for a pose.
+        """
         achieved = observation[..., self.start : self.start + self.goal.size]
         scale = _POSITION_SCALES[self.goal]
         if self.goal is not GoalKind.POSE:
@@ -104,7 +112,7 @@ class SymmetricObject:
     symmetry: str
 
     def inputs(self, seen: Seen, normalized: Seen) -> Array:
-        """Return the network inputs, in which the symmetric form replaces pose, velocity and goal.
+        """Return the network inputs, with symmetric rotation, angular velocity and goal difference.
 
         Args:
             seen: Observation and goal, (..., size) each, in the units of the task. The observation
@@ -125,7 +133,7 @@ class SymmetricObject:
         )
 
     def goal_position(self, observation_size: int, size: int) -> list[int]:
-        """Return the indices of the network inputs that depend on the position of a pose goal."""
+        """Return the indices of the last 3 of `size` inputs; they depend on the goal's position."""
         del observation_size
         return [*range(size - 3, size)]
 

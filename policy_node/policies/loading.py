@@ -42,7 +42,7 @@ def shipped_actors() -> dict[str, Path]:
 
 
 def shipped_name(task: str, kind: str) -> str:
-    """Return the name of a task's shipped policy: the usual one (`kind` '') or the robust one."""
+    """Return the name of a task's shipped actor of a kind: '' (the usual one) or `robust`."""
     return f'{task}_{kind}' if kind else task
 
 
@@ -54,8 +54,8 @@ def actor_path(name_or_path: str | Path, others: Sequence[str] = ()) -> Path:
         others: Further names that the caller accepts, listed in the error message.
 
     Raises:
-        ValueError: If neither exists. The message lists the shipped actors; for the folder of a
-            run it names its best actor.
+        ValueError: If no such actor or file exists. The message lists the shipped actors, or
+            the file of the best actor if the path is the folder of a run.
     """
     shipped = shipped_actors()
     if str(name_or_path) in shipped:
@@ -163,7 +163,7 @@ def _untrained(name: str, task: str | None) -> LoadedPolicy:
 
 
 def _shipped(task: str | None, kind: str) -> Path:
-    """Return the shipped actor of a task: the usual one (kind ''), or the robust one."""
+    """Return the file of a task's shipped actor of a kind: '' (the usual one) or `robust`."""
     what = f'{kind} actor' if kind else 'actor'
     task, shipped = _require_task(f'the shipped {what}', task), shipped_actors()
     if shipped_name(task, kind) not in shipped:

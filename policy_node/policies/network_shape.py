@@ -77,13 +77,16 @@ class NetworkShape:
         return concatenate(inputs, seen[..., size:]) if self.past_actions else inputs
 
     def hidden_names(self) -> list[tuple[str, str]]:
-        """Return the names of each hidden layer and of its LayerNorm in the state of an `Actor`."""
+        """Return the names in an `Actor` of the modules (hidden layer, its LayerNorm), in order.
+
+        The second name has no meaning without `layer_norm`.
+        """
         stride = 3 if self.layer_norm else 2
         places = range(0, stride * len(self.hidden_sizes), stride)
         return [(f'network.hidden.{i}', f'network.hidden.{i + 1}') for i in places]
 
     def tensor_shapes(self) -> dict[str, tuple[int, ...]]:
-        """Return the shape of every tensor in the state of an `Actor`, by name."""
+        """Return the shape of every tensor in the `state_dict` of an `Actor`, by name."""
         shapes: dict[str, tuple[int, ...]] = {}
         for part, size in (('observation', self.input_size), ('goal', self.goal_size)):
             for statistic in ('mean', 'std'):
@@ -105,7 +108,10 @@ class NetworkPolicy:
     shape: NetworkShape
 
     def act(self, seen: NDArray[np.float32], goal: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return actions (..., action_size) for `seen` (..., input_size) and `goal`."""
+        """Return actions (..., action_size) for `seen` and `goal`.
+
+        `seen` contains the observation and past actions, (..., input_size).
+        """
         raise NotImplementedError
 
     def predict(

@@ -47,7 +47,7 @@ class NumpyActor(NetworkPolicy):
         self._values = {name: values.astype(np.float64) for name, values in tensors.items()}
 
     def act(self, seen: NDArray[np.float32], goal: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return actions (..., action_size) for `seen` (..., input_size) and `goal`."""
+        """Return actions (..., action_size) for `seen` (observation, past actions) and `goal`."""
         # Rounded to float32 first, as in training.
         given = seen.astype(np.float64), goal.astype(np.float64)
         normalized = (

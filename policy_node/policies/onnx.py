@@ -57,7 +57,7 @@ class OnnxActor(NetworkPolicy):
         self._check_sizes(path)
 
     def act(self, seen: NDArray[np.float32], goal: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return actions (..., action size) for `seen` and `goal`, (..., size) each."""
+        """Return actions (..., action size) for observation `seen` and `goal`, (..., size) each."""
         flat = [part.reshape(-1, part.shape[-1]) for part in (seen, goal)]
         (action,) = self._session.run([OUTPUT], dict(zip(INPUTS, flat, strict=True)))
         return np.asarray(action, np.float32).reshape(*seen.shape[:-1], -1)
@@ -138,7 +138,7 @@ def _try_out(data: bytes, path: Path) -> None:
 
 
 def _trial(path: Path) -> int:
-    """Run the ONNX file on standard input once; return 1 after an error line if it fails."""
+    """Run the ONNX file on standard input once; return 0, or 1 after one error line on stderr."""
     data = sys.stdin.buffer.read()
     try:
         _require_onnxruntime(path)

@@ -267,8 +267,9 @@ _NARROWEST = 60
 def print_table(report: dict[str, Any]) -> None:
     """Print the summary of an evaluation as a table, with 95 % intervals.
 
-    `report` is the result of `summarize` with the additional keys `task` and `policy`. Optional
-    keys are `disturbances` and `against`: the other policy and the result of `compare`.
+    `report` is the result of `summarize` with the additional keys `task` and `policy`. The optional
+    key `disturbances` marks the robot as disturbed. The optional key `against` contains the result
+    of `compare` and `policy`, the name of the other policy.
     """
     title = f'{report["task"]}: {report["policy"]}, {report["episodes"]} episodes'
     if 'disturbances' in report:

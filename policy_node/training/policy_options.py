@@ -38,7 +38,7 @@ def add_batch_options(parser: argparse.ArgumentParser, num_envs: int, episodes: 
 
 
 def add_simulation_options(parser: argparse.ArgumentParser, num_envs: int) -> None:
-    """Add the options that `make_chosen_simulation` reads."""
+    """Add the options of `make_chosen_simulation`: batch, disturbances, success rule and reward."""
     add_batch_options(parser, num_envs)
     add = parser.add_argument
     presets = 'none, mild, hardware, severe, scaled as in hardware*0.5, or a YAML file'

@@ -134,8 +134,8 @@ def _read_experience(config: TrainConfig, directory: Path | None) -> Episodes | 
     """Load the logged episodes in `directory` and report skipped ones; None without a directory.
 
     Raises:
-        ValueError: If a field excludes logged episodes, no episode is usable, or the replay is too
-            small.
+        ValueError: If a setting, such as algorithm `ppo`, cannot use logged episodes, no episode is
+            usable, or the replay is too small.
     """
     if directory is None:
         return None

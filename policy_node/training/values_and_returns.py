@@ -108,7 +108,7 @@ def _judge(
 def discounted(rewards: NDArray[np.float64], gamma: float) -> NDArray[np.float64]:
     """Return the discounted returns (ticks, episodes) from each tick on.
 
-    Rewards after the end of an episode are assumed to equal the mean of its last rewards.
+    Rewards after the end of an episode are assumed to equal the mean of its last 20 rewards.
     """
     following = rewards[-_LAST_TICKS:].mean(axis=0) / (1.0 - gamma)
     returns = np.empty_like(rewards)

@@ -257,7 +257,10 @@ class FetchTask(Task):
         return np.zeros((self.batch.nsim, self.spec.robot.action_size))
 
     def _finger_controls(self, fingers: NDArray[np.floating] | float) -> Array:
-        """Return actuator targets: for position actuators, command plus present finger position."""
+        """Return actuator controls (N, actuators) for finger commands (N, 1) or one number.
+
+        A position actuator gets the command plus the present finger position, as its target.
+        """
         model = self.model
         controls = np.broadcast_to(fingers, self._ctrl.shape).astype(np.float64)
         relative = np.flatnonzero(model.actuator_biastype != mujoco.mjtBias.mjBIAS_NONE)
@@ -268,8 +271,8 @@ class FetchTask(Task):
     def step(self) -> None:
         """Advance one tick; then shut the fingers of a blocked gripper and run a forward pass.
 
-        The pass computes positions only, unless the batch has `keeps_data`. Models with a blocked
-        gripper have no actuators and therefore no efforts.
+        The pass computes positions only, unless the batch has `keeps_data`. Efforts need no pass,
+        because models with a blocked gripper have no actuators.
         """
         try:
             super().step()

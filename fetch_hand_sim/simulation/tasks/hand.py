@@ -78,7 +78,7 @@ class HandTask(Task):
         return self._ctrl.copy()
 
     def _fingertip_poses(self) -> Array:
-        """Return positions, m, and body orientations, wxyz, of the five fingertips, (N, 35)."""
+        """Return five fingertip poses (N, 35): position, m, and body quaternion, wxyz, of each."""
         positions = self._site_xpos[:, self._fingertip_sites]
         quaternions = self._xquat[:, self._fingertip_bodies]
         return np.concatenate([positions, quaternions], axis=2).reshape(self.batch.nsim, -1)

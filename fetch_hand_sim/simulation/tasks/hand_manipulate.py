@@ -168,7 +168,10 @@ class HandManipulateTask(HandTask):
         return quaternion_multiply(about_z, faces[generator.integers(len(faces))])
 
     def sample_goal(self, index: int, generator: np.random.Generator) -> Array:
-        """Draw a goal pose: the present position, shifted if it counts, and a random rotation."""
+        """Draw a goal pose (7,): the object's present position and a random rotation.
+
+        A random offset is added to the position if the task counts positions.
+        """
         position = self._object_qpos[index, :3].copy()
         if self.spec.position_counts:
             position += generator.uniform(TARGET_RANGE[:, 0], TARGET_RANGE[:, 1])

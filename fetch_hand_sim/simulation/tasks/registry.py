@@ -28,8 +28,8 @@ def make_task(name: str, batch: BatchConfig | None = None) -> Task:
 
     Raises:
         ValueError: If the task is unknown or the rate is not allowed. For third-party tasks also if
-            the simulation is missing, or its model differs from its `ASSET`, has another time step
-            than `PHYSICS_TIMESTEP`, or lacks a joint of the specification.
+            the simulation class is missing or compiles another file than its `ASSET`, or if the
+            model has a time step other than `PHYSICS_TIMESTEP` or lacks a joint of the task.
     """
     batch = batch or BatchConfig()
     control_hz = batch.control_hz if batch.timing == 'seconds' else DEFAULT_CONTROL_HZ

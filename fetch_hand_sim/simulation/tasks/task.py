@@ -344,7 +344,7 @@ class Task(ABC):
 
 
 def _scalar_joint(spec: TaskSpec, model: mujoco.MjModel, name: str) -> Any:
-    """Return a hinge or slide joint by name; raise ValueError, which lists all, if missing."""
+    """Return `model.joint(name)`; raise ValueError unless it is a hinge or slide joint."""
     kinds = (mujoco.mjtJoint.mjJNT_SLIDE.value, mujoco.mjtJoint.mjJNT_HINGE.value)
     number = find(model, mujoco.mjtObj.mjOBJ_JOINT, name)
     if number < 0 or model.jnt_type[number] not in kinds:
@@ -386,7 +386,7 @@ class SiteMotion:
         The sum has a fixed order, so batches of any size give the same bits.
 
         Args:
-            dofs: Indices of degrees of freedom, (n,), all of them in the attribute `dofs`.
+            dofs: Indices of degrees of freedom that move the site, (n,).
             velocity: Velocities of these degrees of freedom, (N, n).
         """
         spatial = (self._cdof[:, dofs] * velocity[:, :, None]).sum(axis=1)

@@ -33,7 +33,7 @@ def can_be_pulled(model: mujoco.MjModel, body: int) -> bool:
 def pulls(model: mujoco.MjModel, snapshot: messages.PerturbSnapshot) -> list[tuple[str, Array]]:
     """Return name and wrench (6,), N and N m, of each pulled body in a snapshot of forces.
 
-    Wrenches act at the centre of mass, along the world axes. A snapshot of another model has none.
+    Wrenches act at the centre of mass, along the world axes. A snapshot of another model gives [].
     """
     size = mujoco.mj_stateSize(model, _FORCES)
     if snapshot.state_sig != _FORCES or snapshot.state.shape != (size,):
@@ -78,7 +78,7 @@ class BodyDrag:
         return True
 
     def move(self, delta: Sequence[float]) -> messages.PerturbSnapshot:
-        """Follow the mouse and return the forces on all bodies; the viewer draws them, too.
+        """Move the spring's end with the mouse; return the forces on all bodies as a message.
 
         `delta` (2,) is the movement since the last call, in widths and heights of the picture.
         """
@@ -100,7 +100,7 @@ class BodyDrag:
 def _body_under(
     model: mujoco.MjModel, data: mujoco.MjData, options: mujoco.MjvOption, ray: Ray
 ) -> tuple[int, Array]:
-    """Return the first body that a ray hits, except the ghost, and the point (3,); -1 for none."""
+    """Return id (-1 if none) of the first body on a ray, except the ghost, and the point (3,)."""
     ghost = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY.value, GHOST)
     geom = np.full((1, 1), -1, dtype=np.int32)
     distance = mujoco.mj_ray(

@@ -51,8 +51,8 @@ class Teleoperation:
     def hold(self, direction: int, seconds: float) -> None:
         """Change the selected value by an arrow key; call it in every frame, also without a key.
 
-        A key moves a target position slowly. It sets a distance per tick (see `is_move`) to its
-        limit while held, and to 0 when released.
+        A held key moves a target position through its range in 2 s. It sets a distance per tick
+        (see `is_move`) to its limit; a released key sets it to 0.
 
         Args:
             direction: -1 or 1 while a key is held, 0 without a key.

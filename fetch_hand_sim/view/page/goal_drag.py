@@ -29,7 +29,7 @@ class Handle:
 
 
 def handles(spec: TaskSpec, goal: Array) -> list[Handle]:
-    """Return the points at which a goal can be grabbed."""
+    """Return the points of a goal that the mouse can grab; a pose has one, its drawn position."""
     if spec.goal is GoalKind.POSE:
         return [Handle(0, ghost_pose(spec, goal)[:3])]
     return [Handle(index, point) for index, point in enumerate(goal.reshape(-1, 3))]
@@ -51,7 +51,7 @@ def moved_goal(
         goal: (goal size,) the goal when the mouse grabbed it.
         handle: The grabbed point.
         ray: The present ray under the mouse.
-        is_turning: Whether to turn a pose instead of moving it.
+        is_turning: Whether to turn a pose, not move it; a pose without position always turns.
         delta: (2,) movement of the mouse since the grab, in widths and heights of the picture.
     """
     if spec.goal is GoalKind.POSE and (is_turning or not spec.position_counts):

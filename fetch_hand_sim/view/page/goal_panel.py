@@ -22,7 +22,7 @@ _FINGERS = ('first finger', 'middle finger', 'ring finger', 'little finger', 'th
 
 
 def position_ranges(spec: TaskSpec) -> tuple[tuple[float, float], ...]:
-    """Return the ranges of the sliders for x, y and z, metres."""
+    """Return (lower, upper) of the sliders for x, y and z, metres: about the range of the goals."""
     if spec.goal is GoalKind.FINGERTIPS:
         return _FINGERTIP_RANGES
     if not spec.robot.has_gripper_command:
@@ -61,7 +61,7 @@ class GoalPanel:
 
 
 def _draw_position(spec: TaskSpec, position: Array) -> None:
-    """Draw sliders for a position (3,), metres, and write the new values into it."""
+    """Draw sliders for x, y and z and write their values into `position` (3,), metres."""
     for axis, (lower, upper) in enumerate(position_ranges(spec)):
         imgui.SetNextItemWidth(ITEM_WIDTH)
         name, value = f'{"xyz"[axis]} (m)', float(position[axis])
@@ -69,7 +69,7 @@ def _draw_position(spec: TaskSpec, position: Array) -> None:
 
 
 def _draw_angles(spec: TaskSpec, quaternion: Array) -> Array:
-    """Draw sliders for the Euler angles (`rotations.py`) and return the new quaternion."""
+    """Draw sliders for the Euler angles; return the new quaternion, or `quaternion` if unmoved."""
     angles = quaternion_to_euler(quaternion)
     axes = (2,) if spec.looks_like == 'HandManipulateBlockRotateZ' else (0, 1, 2)
     has_changed = False

@@ -99,7 +99,7 @@ class Panels:
 
 
 def _height(is_shown: bool) -> float:
-    """Return the height, pixels, of the current window, or of the button of a hidden one."""
+    """Return the height in pixels of the current window, or of its button if it is hidden."""
     return float(imgui.GetWindowSize().y) if is_shown else _BUTTON_HEIGHT
 
 

@@ -55,7 +55,7 @@ def command_curves(part: CommandPart, graphs: Graphs, index: int) -> dict[str, S
 def value_limits(
     curves: Iterable[Series], threshold: float | None, begin: float, end: float
 ) -> tuple[float, float]:
-    """Return the limits of the vertical axis for curves and threshold in `begin` ... `end`, s."""
+    """Return the y limits that show the threshold and all curves from time `begin` to `end`, s."""
     parts = [each.values[(each.times >= begin) & (each.times <= end)] for each in curves]
     values = np.concatenate([*parts, [] if threshold is None else [threshold]])
     values = values[np.isfinite(values)]

@@ -29,7 +29,7 @@ class Windows:
         self._has_folded = False
 
     def fold_once(self, *names: str) -> None:
-        """Hide the named windows at the first call; later calls do nothing."""
+        """Hide the named windows at the first call; later calls do nothing, whatever the names."""
         if not self._has_folded:
             self._has_folded = True
             self._hidden.update(names)

@@ -247,7 +247,7 @@ class Values:
 
 @dataclass(frozen=True, kw_only=True)
 class Subgoals:
-    """Settings of subgoals, imagined or proposed by a second, high level."""
+    """Settings of subgoals, imagined or proposed by a second, high-level policy."""
 
     subgoal_prior: Annotated[float, Range(0)] = 0.0
     """Weight in the actor loss of the distance between its actions and those for an imagined
@@ -360,7 +360,7 @@ class TrainConfig(
 
     @property
     def tick_share(self) -> float:
-        """Duration of a tick in units of `gamma`: 1, or tick / 40 ms with `discount=time`."""
+        """Exponent of `gamma` and factor on rewards: 1, or tick / 40 ms with `discount=time`."""
         return DEFAULT_CONTROL_HZ / self.control_hz if self.discount == 'time' else 1.0
 
     @property
@@ -679,8 +679,8 @@ def idle_parts(config: TrainConfig, critic_first: int = 0) -> Iterator[str]:
 
     Args:
         config: Configuration of the whole run.
-        critic_first: Updates of the critic before the actor learns, if more than
-            `config.critic_first`.
+        critic_first: Updates of the critic before the actor learns, as the learner chose them. A
+            larger `config.critic_first` replaces it.
     """
     c = config
     spec = task_spec(c.task, control_hz=c.control_hz)

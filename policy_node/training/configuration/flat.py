@@ -61,12 +61,13 @@ def from_flat(fields: Mapping[str, Any], **changes: Any) -> TrainConfig:
     """Build a configuration from values by field name; missing fields get their default.
 
     Args:
-        fields: Values of a recipe or a stored run. The default replaces a value without effect.
+        fields: Values of a recipe or a stored run. Fields without effect get their default, for
+            example fields of `ddpg` with `algorithm=ppo`.
         **changes: Values set by the user, which replace those in `fields`.
 
     Raises:
         ValueError: If a field is unknown, a value is not allowed, fields exclude each other, or a
-            value in `changes` has no effect.
+            value in `changes` has no effect with the other fields.
     """
     values = types.SimpleNamespace(**{**DEFAULTS, **typed_fields(fields), **typed_fields(changes)})
     if not hasattr(values, 'task'):
@@ -86,7 +87,8 @@ def changed(config: TrainConfig, **changes: Any) -> TrainConfig:
     """Return a copy of a configuration with the fields in `changes` replaced.
 
     Raises:
-        ValueError: If a field is unknown, or a value is not allowed or has no effect.
+        ValueError: If a field is unknown, or a value is not allowed or has no effect with the
+            other fields.
     """
     return from_flat(to_flat(config), **changes)
 
@@ -105,7 +107,7 @@ def config_from_dict(values: Mapping[str, Any], **changes: Any) -> TrainConfig:
 
 
 def removed_fields(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the values of a stored run for removed fields, except default values."""
+    """Return the values of fields that no longer exist, by name, except their former defaults."""
     return {n: values[n] for n, default in REMOVED.items() if values.get(n, default) != default}
 
 

@@ -24,7 +24,7 @@ _DECIDE_AT_RATES = (
 
 
 def ticks_of_40_ms(control_hz: float) -> float:
-    """Return the number of ticks in 40 ms, the unit of step counts that all rates share."""
+    """Return the number of ticks in 40 ms, the duration of a tick at the default 25 Hz."""
     return control_hz / DEFAULT_CONTROL_HZ
 
 
@@ -61,11 +61,12 @@ def recipe_config(task: str, recipe: str, **overrides: Any) -> TrainConfig:
 
 
 def _at_rate(task: str, values: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the changes to `best` for another action frequency, at equal simulated time.
+    """Return the changes to `values`, the recipe `best`, for `control_hz` in `overrides`.
 
-    At 25 Hz the result is empty. Above 25 Hz, it also sets a discount per 40 ms, exploration noise
-    that lasts 40 ms and n-step returns over 40 ms (docs/research/rates). These are left out if
-    `overrides` contains a field in `_DECIDE_AT_RATES`.
+    At 25 Hz the result is empty. Otherwise step counts change to equal simulated time. Above 25 Hz,
+    the result also sets a discount per 40 ms, exploration noise that lasts 40 ms and n-step returns
+    over 40 ms (docs/research/rates). These are left out if `overrides` has one of them or a similar
+    field (`_DECIDE_AT_RATES`).
     """
     control_hz = overrides.get('control_hz', DEFAULT_CONTROL_HZ)
     if control_hz == DEFAULT_CONTROL_HZ:
@@ -212,8 +213,8 @@ def _robust(task: str) -> dict[str, Any]:
     """Return the fields of the recipe `robust`, which imitates the shipped policy.
 
     The robot is disturbed by half of the preset `hardware`, with an action latency of 0 to 2
-    ticks. For tasks in `_EXACT` the scale differs, and a critic weights errors of actions
-    (docs/robust_policies.md).
+    ticks. For FetchSlide and FetchPickAndPlace the scale differs, and the loss also contains the
+    value that actions lose according to a critic (docs/robust_policies.md).
     """
     scale, in_turn = _EXACT.get(task, (0.5, (1.0,)))
     scaled = PRESETS['hardware'].scaled(scale)

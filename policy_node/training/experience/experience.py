@@ -150,7 +150,7 @@ class Experience:
     def _draw(
         self, mixture: dict[str, float], sampler: TransitionSampler | None = None
     ) -> Transitions:
-        """Draw a batch with `sampler`, by default with the sampler of this experience."""
+        """Draw a batch by `sampler`, if given; `mixture` maps goal sources to probabilities."""
         chosen, replay = sampler or self._sampler, self.replay
         row = self._draw_rows()
         return chosen.sample(replay.episodes, row, mixture, self.generator, replay.valid_ticks)
@@ -170,8 +170,8 @@ def ticks_until_dropped(
 ) -> Callable[[Episodes], NDArray[np.int64]] | None:
     """Return a function that returns how many ticks of each episode to learn from, (episodes,).
 
-    They end `more` ticks after the centre of the object fell below the palm. Return None, which
-    means all ticks, if the task has no object in a hand or `more` is negative.
+    These ticks end `more` ticks after the centre of the object fell below the palm. Return None,
+    which means all ticks, if the task has no object in a hand or `more` is negative.
     """
     if spec.goal is not GoalKind.POSE or more < 0:
         return None

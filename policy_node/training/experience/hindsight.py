@@ -118,7 +118,7 @@ def _displaced(starts: Starts, generator: np.random.Generator) -> Array32:
 
     The displacement is a motion between two states of a random episode, at most ten ticks apart.
     It is independent of the transition. In contrast, `future` goals depend on where the transition
-    led, so values are overestimated where contacts make this random.
+    led. So values are overestimated where contacts make the outcome of a transition random.
     """
     episodes, count = starts.episodes, len(starts.row)
     row = generator.integers(len(episodes), size=count)

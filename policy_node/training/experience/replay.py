@@ -186,7 +186,7 @@ def draw_by(sums: Array, count: int, generator: np.random.Generator) -> NDArray[
 
 
 def has_moved(episodes: Episodes) -> NDArray[np.float64]:
-    """Return (episodes,): 1 if the achieved goal moved by more than `MOVED_DISTANCE`, else 0."""
+    """Return (episodes,): 1 if the achieved goal ever left its start by `MOVED_DISTANCE`, or 0."""
     offset = episodes.achieved_goal - episodes.achieved_goal[:, :1]
     moved = np.square(offset).sum(axis=-1).max(axis=-1) > MOVED_DISTANCE**2
     return np.asarray(moved, dtype=np.float64)

@@ -20,10 +20,10 @@ class GradedReward:
     """A reward between -1 and 0 that rises with the number of thresholds met.
 
     The reward is the share of distance thresholds met, minus 1. If the goal has a rotation, this
-    share is multiplied by that of the rotation thresholds. The sparse reward does not show how
-    nearly a goal was missed or how safely it was met. With it, an actor holds an object no better
-    than the threshold requires. If goals have a position and a rotation, the actor neglects one of
-    them as long as it never meets both.
+    share is multiplied by the share of rotation thresholds met. The sparse reward does not show how
+    nearly a goal was missed or how safely it was met. With the sparse reward, an actor holds an
+    object no better than the threshold requires. If goals have a position and a rotation, that
+    actor neglects one of them as long as it never meets both.
 
     Attributes:
         metric: Distance and rotation to the goal, and the success thresholds.

@@ -146,8 +146,8 @@ class TransitionSampler:
     ) -> Transitions:
         """Return n-step transitions of the lengths `steps`, (batch,), with discounted rewards.
 
-        `reward_after(achieved, indices)` returns rewards for achieved goals of the transitions with
-        these indices.
+        `reward_after(achieved, indices)` returns the rewards of achieved goals (n, goal_size).
+        `indices` (n,) are the rows of `goal` with which these achieved goals are compared.
         """
         episodes, row, tick = starts.episodes, starts.row, starts.tick
         total = np.zeros(len(steps))

@@ -74,7 +74,7 @@ class ActorCritic:
     def step(
         self, optimizer: torch.optim.Adam, loss: Tensor, parameters: Sequence[nn.Parameter]
     ) -> None:
-        """Take one optimizer step on `parameters` with the gradient of `loss` over all workers."""
+        """Take one optimizer step on `parameters` with the mean gradient of `loss` over workers."""
         gradients = torch.autograd.grad(loss, parameters)
         self.workers.average_gradients(gradients)
         for parameter, gradient in zip(parameters, gradients, strict=True):
@@ -131,7 +131,7 @@ class ActorCritic:
 
 
 def set_learning_rate(optimizer: torch.optim.Adam, config: TrainConfig, progress: float) -> None:
-    """Set the learning rate at `progress`, the finished share of the run, clipped to 0 ... 1."""
+    """Set the learning rate for `progress`, the finished share of the run (clipped to 0 ... 1)."""
     share = min(max(progress, 0.0), 1.0)
     rate = config.learning_rate * (1.0 - share * (1.0 - config.final_learning_rate))
     optimizer.param_groups[0]['lr'] = rate

@@ -107,7 +107,7 @@ class ThresholdSampler(TransitionSampler):
 
 @dataclass(frozen=True, kw_only=True)
 class HorizonSampler(TransitionSampler):
-    """Draws how many steps are left; values are the returns of these (TDM, arXiv 1802.09081).
+    """Draws how many steps are left; a value is the return of these steps (TDM, arXiv 1802.09081).
 
     Attributes:
         ticks: Length of an episode. The condition is the number of steps left, divided by it.

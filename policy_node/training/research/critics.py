@@ -67,7 +67,7 @@ def members_of(tensors: dict[str, Tensor]) -> list[dict[str, Tensor]]:
 
 
 def as_one(members: list[dict[str, Tensor]], critics: int) -> dict[str, Tensor]:
-    """Merge the tensors of critics, with the names that a learner with `critics` critics uses."""
+    """Merge the tensors of at most `critics` members, named as in a run with `critics` critics."""
     if critics == 1:
         return members[0]
     return {f'members.{i}.{n}': value for i, m in enumerate(members) for n, value in m.items()}
@@ -90,7 +90,7 @@ class EnsembleLoss(CriticLoss):
         return Critic(features + shape.action_size, shape_here, self.options.quantiles)
 
     def pooled(self, values: Tensor) -> Tensor:
-        """Aggregate the values (critics, batch) of all critics into one value, (batch,)."""
+        """Combine the values (critics, batch) by the configured `aggregate`; return (batch,)."""
         return values if self.options.critics == 1 else AGGREGATES[self.options.aggregate](values)
 
 

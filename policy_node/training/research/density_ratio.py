@@ -45,7 +45,7 @@ Inputs = tuple[Tensor, Tensor]
 
 
 class DensityRatio(nn.Module):
-    """The two classifiers, without and with the next state, and their optimizer."""
+    """Two classifiers that separate goals from shuffled ones, without and with the next state."""
 
     def __init__(self, feature_size: int, goal_size: int, action_size: int) -> None:
         super().__init__()

@@ -23,13 +23,13 @@ from policy_node.training.learners.ddpg import DDPG, TensorBatch
 
 
 def ticks_of(length: Array32, most: int) -> NDArray[np.int64]:
-    """Convert lengths of actions, [-1, 1] as the actor returns them, to ticks, 1 ... `most`."""
+    """Convert how long actions hold, from the actor's output in [-1, 1] to ticks, 1 ... `most`."""
     share = (np.asarray(length, np.float64) + 1.0) / 2.0
     return 1 + np.rint(share * (most - 1)).astype(np.int64)
 
 
 def length_of(ticks: NDArray[np.int64], most: int) -> Array32:
-    """Convert ticks, 1 ... `most`, to lengths of actions in [-1, 1], float32."""
+    """Convert how long actions hold, from ticks, 1 ... `most`, to the actor's output in [-1, 1]."""
     return (2.0 * (ticks - 1) / (most - 1) - 1.0).astype(np.float32)
 
 
@@ -72,7 +72,7 @@ class HoldingSampler(TransitionSampler):
     def steps(
         self, starts: Starts, goal: Array32, generator: np.random.Generator
     ) -> NDArray[np.int64]:
-        """Return the length of each n-step return, (batch,): the ticks its action still holds."""
+        """Return how many ticks each action still holds, up to the last valid tick, (batch,)."""
         del goal, generator
         length = starts.episodes.action[starts.row, starts.tick, -1]
         left: NDArray[np.int64] = starts.last - starts.tick

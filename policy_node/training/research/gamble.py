@@ -32,9 +32,10 @@ _OVER = 1.0
 class GambleSimulation(Simulation):
     """Simulations in which a gamble moves the achieved goal at random and ends the motion.
 
-    The landing is drawn like a goal by the generator of the episode, independent of its goal. From
-    the gamble to the end of the episode the observation stays constant: the achieved goal at the
-    landing, no velocities, fingers at 1 m. The physics continue, but are not observed.
+    The landing is drawn like a goal by the generator of the episode, independent of the desired
+    goal. From the gamble to the end of the episode the observation stays constant: the achieved
+    goal at the landing, no velocities, and finger positions of 1 m, which mark a gamble. The
+    physics continue, but are not observed.
 
     Args:
         task: One of `config.GAMBLE_TASKS`.

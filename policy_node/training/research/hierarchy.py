@@ -43,7 +43,7 @@ _SMALLEST_NORM = 1e-6
 
 
 def subgoals_of(starts: Starts, generator: np.random.Generator | None = None) -> Array32:
-    """Return the subgoals pursued at the start of each transition, (batch, goal_size)."""
+    """Return the subgoals (batch, goal_size) pursued in the states `starts`; ignore `generator`."""
     del generator
     episodes = starts.episodes
     size = episodes.desired_goal.shape[-1]
@@ -169,9 +169,10 @@ _HIGH = 'high_'
 
 
 def with_subgoals(mixture: dict[str, float]) -> dict[str, float]:
-    """Return the mixture with half of the goals of episodes replaced by subgoals.
+    """Return a mixture of goal sources in which subgoals take half of the share of `real`.
 
-    HAC would replace all of them, because its lowest level never pursues the goal itself.
+    The source `real` keeps the desired goal of the episode. HAC would replace all of its share,
+    because the lowest level of HAC never pursues the goal itself.
     """
     kept = mixture.get('real', 0.0) / 2
     return mixture if kept == 0.0 else {**mixture, 'real': kept, _SUBGOAL: kept}
@@ -190,7 +191,10 @@ class HierarchicalTransitions(Transitions):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SubgoalSampler(TransitionSampler):
-    """Draws transitions of the high level, each over the `subgoal_every` ticks of a subgoal."""
+    """Draws transitions of the high level, each over `subgoal_every` ticks.
+
+    Tested subgoals that the actor missed get `missed_value` as their value.
+    """
 
     missed_value: float
 
@@ -217,7 +221,10 @@ class SubgoalSampler(TransitionSampler):
     def _ticks(
         self, episodes: Episodes, count: int, generator: np.random.Generator
     ) -> NDArray[np.int64]:
-        """Draw the ticks (count,) at which transitions begin; some of them begin a subgoal."""
+        """Draw the ticks (count,) at which transitions begin.
+
+        The share `_DECISIONS` begins at ticks with a new subgoal, all others at any tick.
+        """
         last, every = episodes.ticks - self.most_steps, self.most_steps
         decision = every * generator.integers(last // every + 1, size=count)
         anywhere = generator.integers(last + 1, size=count)

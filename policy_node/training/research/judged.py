@@ -80,7 +80,7 @@ class ChoosingSampler(TransitionSampler):
         return goal
 
     def _best(self, starts: Starts, first: Array32, generator: np.random.Generator) -> Array32:
-        """Return the best of `first` and further future goals for each transition."""
+        """Return the goals that `choice` ranks first among `first` and newly drawn future goals."""
         candidates, source = [first], np.zeros(len(first), np.intp)
         for _ in range(CANDIDATES - 1):
             candidates.append(goals_of(starts, source, ['future'], generator))
@@ -94,7 +94,7 @@ class ChoosingSampler(TransitionSampler):
 
 @dataclass(frozen=True, kw_only=True)
 class LambdaSampler(TransitionSampler):
-    """Draws n-step returns with random n, whose mean is the truncated lambda-return."""
+    """Draws n-step returns of random n; their mean is the truncated lambda-return for `trace`."""
 
     trace: float = 0.7
 

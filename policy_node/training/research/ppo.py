@@ -1,8 +1,8 @@
 """Proximal policy optimisation (Schulman et al. 2017, arXiv 1707.06347) for goals.
 
 The policy is the actor with Gaussian noise of `noise_std`, clipped to the range of actions as in
-the collector. The density of a clipped action is that of the noise beyond the limit (Fujita & Maeda
-2018, arXiv 1802.07564). So the densities are those of the collected actions, with one exception:
+the collector. The density of a clipped action is the probability of noise beyond the limit (Fujita
+& Maeda 2018, arXiv 1802.07564). So densities are those with which actions were drawn, except that
 the normalizers already include the new episodes. From the fourth cycle on, this hardly matters.
 """
 

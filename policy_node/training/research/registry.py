@@ -165,7 +165,10 @@ def _extra_actions(config: TrainConfig) -> int:
 
 
 def _weights_of(config: TrainConfig, spec: TaskSpec) -> Weigh:
-    """Return the function that marks episodes whose achieved goal moved without a gamble."""
+    """Return a function that weights episodes by 1 if the achieved goal moved, otherwise by 0.
+
+    In a task with a gamble, the motion to a landing does not count.
+    """
     if not config.gamble:
         return has_moved
     return lambda episodes: has_moved(gamble.without_landings(episodes, spec))

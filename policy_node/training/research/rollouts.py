@@ -8,7 +8,7 @@ episode with
     w_t = prod_{k <= t} pi(a_k | s_k, g') / pi(a_k | s_k, g),
 
 the per-decision weight of hindsight policy gradients (Rauber et al. 2019, arXiv 1711.06006),
-normalized tick by tick over the replayed episodes, as they propose. Later rewards depend on later
+normalized tick by tick over the replayed episodes, as in that paper. Later rewards depend on later
 actions, which were for g as well. So in an advantage each later error is weighted by the ratios of
 the actions between, cut as in V-trace (Espeholt et al. 2018, arXiv 1802.01561).
 
@@ -71,6 +71,7 @@ class RolloutMaker:
     Attributes:
         critique: Learner that returns the values of states and the densities of actions.
         compute_reward: (achieved_goal, desired_goal) -> reward, batched.
+        trace: The lambda of the advantages.
         corrects: Whether replayed episodes get per-decision weights.
     """
 
@@ -152,6 +153,7 @@ def advantages(
     Args:
         reward: (episodes, T).
         value: (episodes, T + 1); episodes are cut, not terminated, so the last value counts.
+        trace: The lambda of generalized advantages.
         log_ratio: log pi(a | s, g') - log pi(a | s, g), (episodes, T), for the goal g' of `reward`
             and the goal g of the actions; None if these goals are the same.
     """
@@ -196,7 +198,7 @@ class Outcomes:
 
     @classmethod
     def of(cls, episodes: Episodes, metric: GoalMetric, generator: np.random.Generator) -> Outcomes:
-        """Draw states of each episode; keep those whose goal was not met at the start."""
+        """Draw goals achieved in each episode; keep those not met by its first achieved goal."""
         row = np.repeat(np.arange(len(episodes)), _STATES)
         tick = generator.integers(1, episodes.ticks + 1, size=len(row))
         before, after = episodes.achieved_goal[row, 0], episodes.achieved_goal[row, tick]
@@ -209,8 +211,8 @@ class Outcomes:
     def goals(self, starts: Starts, generator: np.random.Generator) -> Array32:
         """Return one goal per episode, (batch, goal_size): the outcome nearest to its desired goal.
 
-        A few outcomes are drawn and moved to the start of the episode. If there are no outcomes,
-        the desired goals are returned.
+        A few outcomes are drawn. The motion from `before` to `after` of each is applied to the goal
+        achieved at the start of the episode. Without outcomes, the desired goals are returned.
         """
         desired = starts.episodes.desired_goal[starts.row]
         if not len(self):
@@ -250,7 +252,7 @@ class OnPolicyExperience(Experience):
 
     Args:
         config: The configuration; `trace` is the lambda of the advantages.
-        weigh: Weights of episodes for `moved_share`.
+        weigh: Returns the weight of each episode, by which `moved_share` of a batch is drawn.
     """
 
     def __init__(
@@ -296,7 +298,7 @@ class OnPolicyExperience(Experience):
         """Return the probability of each goal source, for the statistics of goals.
 
         These statistics use single transitions, for which the source `outcome` is not defined.
-        The source `episode`, with the same distribution, takes its share.
+        The source `episode`, whose goals are similar, takes the share of `outcome`.
         """
         found = dict(super().mixture())
         if _OUTCOME in found:

@@ -105,7 +105,11 @@ def _run(options: argparse.Namespace) -> int:
 def _start(
     options: argparse.Namespace, loaded: LoadedPolicy, simulation: Simulation, file: Path
 ) -> dict[str, Any]:
-    """Return the result to complete; it has points only if an earlier run wrote some to `file`."""
+    """Return the result before the evaluation, with the points that `file` already contains.
+
+    Raises:
+        UsageError: If `file` is not a result of this policy with the same settings.
+    """
     result: dict[str, Any] = {
         'policy': Path(options.policy or loaded.task).name,
         'task': loaded.task,

@@ -85,7 +85,7 @@ def draw_overview(results: Sequence[Mapping[str, Any]]) -> bytes:
 
 
 def _cell(result: Mapping[str, Any], sweep: Sweep) -> tuple[float, str]:
-    """Return the share of levels that a policy withstands (NaN if not measured) and its text."""
+    """Return the share of levels withstood (NaN if not measured), and the highest one as text."""
     if sweep not in sweeps_of(task_spec(result['task'])):
         return float('nan'), ''
     success = {key: point['success'] for key, point in result['points'].items()}

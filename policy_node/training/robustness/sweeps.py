@@ -39,7 +39,10 @@ def _one(group: str, name: str) -> Callable[[float], dict[str, Any]]:
 
 
 def _factors(*names: str) -> Callable[[float], dict[str, Any]]:
-    """Return a function from a level to physics factors, drawn between 1/level and level."""
+    """Return a function from a level to disturbances of the physics.
+
+    They multiply the parameters `names` by random factors between 1/level and level.
+    """
     return lambda level: {'physics': {name: [1.0 / level, level] for name in names}}
 
 

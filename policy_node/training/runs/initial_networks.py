@@ -79,8 +79,8 @@ class InitialNetworks:
     def fitted(self, config: TrainConfig) -> InitialNetworks:
         """Return a copy adapted to a run with this configuration.
 
-        - A critic is left out if its hidden layers have another normalization or its values
-          another meaning. A critic with another `gamma` stays; `critic_first` lets it adapt.
+        - A critic is left out if it was trained with another `norm`, `reward_type` or
+          `control_hz`. A critic with another `gamma` stays; `critic_first` lets it adapt.
         - Past actions may be added as inputs.
         - If the object's position counts only in the new task, the weights of the goal position
           become zero. In the old task the goal position equalled that of the object, so the
@@ -112,7 +112,7 @@ class InitialNetworks:
         return fitted._with_critics(0)
 
     def _shape_in(self, config: TrainConfig) -> NetworkShape:
-        """Return `shape`; if it has no past actions, with those of the configuration."""
+        """Return `shape`, with the configured number of past actions if it has none."""
         past = self.shape.past_actions or config.past_actions
         return replace(self.shape, past_actions=past)
 
@@ -189,7 +189,8 @@ def read_initial_networks(name: str) -> InitialNetworks:
             training state of its run folder.
 
     Raises:
-        ValueError: If the actor or run is missing or damaged.
+        ValueError: If the actor or run is missing or damaged, its critic belongs to another actor,
+            or its learner makes networks that no other run can start from.
     """
     path = Path(os.path.expanduser(name))
     latest = path / LATEST_FILE
@@ -256,7 +257,7 @@ def _read_usual(file: Path, source: Path) -> tuple[TrainingState, TrainConfig]:
     """Read a training state from `file` and return it with its configuration.
 
     Raises:
-        ValueError: If the file is damaged, or if no other run can start from its networks.
+        ValueError: If the file is damaged, or `unusual_networks` lists fields of its training.
     """
     state = read_state(file)
     config = config_from_dict(state.extra['config'])
@@ -277,7 +278,7 @@ def _unconditioned(tensors: dict[str, Tensor], config: TrainConfig) -> dict[str,
 
 
 def _sums(mean: Tensor, std: Tensor, count: int) -> dict[str, Tensor]:
-    """Return the sums of `RunningStatistics` for `count` inputs with this mean and deviation."""
+    """Return the buffers of `RunningStatistics`, by name, after `count` inputs of `mean`, `std`."""
     number = torch.tensor([float(max(count, 1))], dtype=torch.float64)
     mean, std = mean.double(), std.double()
     square = (std.square() + mean.square()) * number
@@ -285,7 +286,7 @@ def _sums(mean: Tensor, std: Tensor, count: int) -> dict[str, Tensor]:
 
 
 def steps_behind(run: dict[str, Any]) -> int:
-    """Return the environment steps of an actor and of all networks that it started from.
+    """Return the total environment steps of an actor and of all networks that it started from.
 
     If several actors come from one run, the run counts once, with its latest actor.
 
@@ -307,8 +308,8 @@ def steps_behind(run: dict[str, Any]) -> int:
 def _run_of(part: dict[str, Any], steps: int) -> object:
     """Return a key that is equal for all actors of a run.
 
-    The key is the folder of the run. If the folder is unknown, it consists of the hash or name of
-    the actor and `steps`.
+    `part` is a record of an actor or run, such as `init_from`. The key is the folder of the run. If
+    the folder is unknown, the key consists of the hash or name in `part` and `steps`.
     """
     name = part.get('name', '')
     if name and ',' not in name:

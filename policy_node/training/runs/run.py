@@ -181,10 +181,11 @@ def _make_trainer(
     resume: bool,
     experience: Episodes | None,
 ) -> AnyTrainer:
-    """Return a trainer with its initial networks or resumed state, and with logged episodes.
+    """Return a trainer, new with `networks` or resumed from `output`, with logged episodes added.
 
     Raises:
-        ValueError: If one of these does not fit the configuration, or memory is too small.
+        ValueError: If the training state or the logged episodes do not fit the configuration, or
+            memory is too small.
     """
     try:
         workers = join_workers(choose_device(config.device))
@@ -259,9 +260,10 @@ def _train(
 
 
 def _prepare_folder(trainer: AnyTrainer, output: Path, command: str, resume: bool) -> None:
-    """Move files of an earlier run into a subfolder, and record the command of this run.
+    """Record the command; before a new run, move files of an earlier run into a subfolder.
 
-    Also warn of parts of training that have no effect, and of slow, emulated bfloat16.
+    Also warn of settings without effect, for example a run that ends before its first update, and
+    of bfloat16 that the processor only emulates.
     """
     if not resume and (note := set_former_run_aside(output)):
         complain(NAME, note)

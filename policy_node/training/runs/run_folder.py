@@ -114,9 +114,9 @@ class RunFolder:
     def read_best(self, counters: Counters) -> None:
         """Set the best success and return of a resumed run, in `counters`, from its best actor.
 
-        The best actor may be newer than the training state. If it is missing, damaged, of another
-        task, or evaluated on fewer episodes or by another rule, success and return are reset. Then
-        the next evaluated actor replaces it.
+        The best actor may be newer than the training state. Success and return are reset if its
+        file is missing, damaged or of another task, or if it was evaluated on fewer episodes or by
+        another `success_rule`. Then the next evaluated actor replaces it.
         """
         file, rule = self.path / BEST_FILE, self.config.success_rule
         if counters.best_success < 0 and not file.is_file():
@@ -160,7 +160,9 @@ class RunFolder:
         counters: Counters,
         with_replay: bool = True,
     ) -> None:
-        """Write a checkpoint: the newest episodes and, on the first worker, latest actor and state.
+        """Write a checkpoint: newest episodes and, on the first worker, actor and training state.
+
+        Without `with_replay`, the earlier file of episodes stays.
 
         Raises:
             OSError: If a file cannot be written; the earlier files stay.

@@ -150,7 +150,7 @@ class RunLog:
 
 
 def evaluation_columns(outcomes: EpisodeOutcomes | None, success_rule: str) -> Row:
-    """Return the results of an evaluation by column of `progress.csv`; empty if none was due."""
+    """Return outcomes as columns of `progress.csv`, success by `success_rule`; empty for None."""
     if outcomes is None:
         return {}
     found = {f'eval_{n}': value for n, value in diagnose(outcomes).items() if n != 'long_way_share'}

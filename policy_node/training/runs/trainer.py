@@ -124,7 +124,7 @@ class BaseTrainer:
         return (reason or 'another worker stopped') if self.workers.any(bool(reason)) else ''
 
     def _ended(self) -> tuple[str, str] | None:
-        """Return the field whose limit is reached, and the reason in words; else None."""
+        """Return the `TrainConfig` field whose limit is reached, and a reason; None without one."""
         config, counters = self.config, self.counters
         if 0 < config.success_target <= counters.best_success:
             return 'success_target', f'success target {config.success_target:g} reached'
@@ -137,8 +137,8 @@ class BaseTrainer:
     def _outcomes(self, policy: Policy, to_beat: float = -1.0) -> EpisodeOutcomes:
         """Evaluate a policy on the same episodes each time.
 
-        The evaluation ends early once the success rate `to_beat` is above the 95 % interval of this
-        policy.
+        The evaluation ends early once the 95 % interval of the success rate of `policy` lies below
+        `to_beat`; the default never ends it early.
         """
         rule = self.config.success_rule
 
@@ -212,9 +212,9 @@ class Trainer(BaseTrainer):
         return {**self.learner.modules(), **self.experience.statistics}
 
     def _seed(self, env_steps: int) -> np.random.Generator:
-        """Make a collector with new seeds, and return a random generator for batches.
+        """Set `collector` to one with new seeds; return a random generator that draws batches.
 
-        Both depend on the seed of the run, the worker and `env_steps`.
+        The seeds of both depend on the seed of the run, the worker and `env_steps`.
         """
         config = self.config
         seeds = np.random.SeedSequence([config.seed, self.workers.rank, env_steps])
@@ -258,9 +258,9 @@ class Trainer(BaseTrainer):
             )
 
     def _let_critic_learn_first(self) -> None:
-        """Let the critics learn alone for `CRITIC_FIRST` updates if some of them started untrained.
+        """Train only the critics for `CRITIC_FIRST` updates if some of them started untrained.
 
-        A `critic_first` in the configuration has priority.
+        A `critic_first` other than 0 in the configuration replaces `CRITIC_FIRST`.
         """
         origin = self._folder.init_from
         critics = self.config.critics
@@ -356,9 +356,9 @@ class Trainer(BaseTrainer):
             )
 
     def _collect_first(self, executor: ThreadPoolExecutor) -> Collected | None:
-        """Collect until the replay of a resumed run is refilled; return one more cycle of episodes.
+        """Refill the replay of a resumed run if needed; return the first cycle to learn from.
 
-        Return None if the run is stopped before.
+        Refilling collects episodes without learning. Return None if the run is stopped meanwhile.
         """
         while True:
             actor, _ = self._prepare_collection(may_evaluate=False)
@@ -384,9 +384,10 @@ class Trainer(BaseTrainer):
         return policy, candidate
 
     def _candidate(self) -> Candidate | None:
-        """Return the actor to evaluate and further policies; None on all workers but the first.
+        """Return the actor to evaluate and other policies; None on all workers but the first.
 
-        The success of the further policies appears only in `progress.csv`.
+        An example of another policy is both levels of a hierarchy together. The success of the
+        other policies appears only in `progress.csv`.
         """
         if not self.workers.is_first:
             return None
@@ -450,7 +451,7 @@ class Trainer(BaseTrainer):
         return losses
 
     def save(self) -> None:
-        """Write a checkpoint: the newest episodes and, on the first worker, latest actor and state.
+        """Write a checkpoint: newest episodes and, on the first worker, actor and training state.
 
         Raises:
             OSError: If a file cannot be written; the earlier files stay.

@@ -130,10 +130,11 @@ def find_study(name: str) -> Study:
 
 
 def jobs_from_arguments(options: argparse.Namespace) -> list[Job]:
-    """Return the jobs, checked against the run folders.
+    """Return the jobs that the options select.
 
     Raises:
-        ValueError: If a value is not allowed or differs from an existing run.
+        ValueError: If an option has a value that is not allowed, or the folder of a job contains a
+            run with another configuration.
     """
     study: Study = options.study
     if options.actors is not None and not study.ships:
@@ -216,7 +217,7 @@ def _run(options: argparse.Namespace, command: str) -> int:
 
 
 def _not_stored(jobs: Sequence[Job], folder: Path) -> list[Job]:
-    """Return the jobs whose runs the report does not contain."""
+    """Return the jobs whose runs the report folder lacks; print how many runs it contains."""
     runs = read_runs(folder)
     missing = [job for job in jobs if not holds(runs, job)]
     if len(missing) < len(jobs):
@@ -228,7 +229,7 @@ def _not_stored(jobs: Sequence[Job], folder: Path) -> list[Job]:
 def _place(
     options: argparse.Namespace, report: Path, command: str
 ) -> contextlib.AbstractContextManager[Place]:
-    """Return the runner of the jobs that the options choose: this process, others or Ray."""
+    """Return the place where jobs run, by `--jobs` and `--ray`: this process, several or Ray."""
     cores = len(os.sched_getaffinity(0))
     limit = options.jobs or (cores if options.study.ships else 1)
     if options.ray:

@@ -50,9 +50,9 @@ class Curve:
 def measure_run(job: Job, command: str) -> dict[str, Any]:
     """Measure a trained job on fresh episodes and return its line of `runs.jsonl`.
 
-    If no evaluation reached 0.9, `steps_to_0.9` is missing (null), and the run is censored at its
-    budget. `parts` counts how often the run was started. A resumed run has other resets than an
-    uninterrupted one.
+    `steps_to_0.9` is the number of steps of 40 ms until an evaluation first reached a success rate
+    of 0.9, or None. `parts` counts how often the run was started. A resumed run (`parts` > 1) has
+    other training episodes than an uninterrupted one.
 
     Raises:
         ValueError: If the log has no evaluation or a file of the run is damaged.
@@ -94,7 +94,10 @@ def measure_run(job: Job, command: str) -> dict[str, Any]:
 
 
 def _final_success(job: Job) -> float | None:
-    """Return the success of the last actor on fresh episodes, which all runs share."""
+    """Return the success rate of the last actor on fresh episodes; None for 0 `final_episodes`.
+
+    All jobs are measured on the same seeds, which training and its evaluations never use.
+    """
     episodes, config = job.final_episodes, job.config
     if not episodes:
         return None
@@ -135,9 +138,9 @@ def sum_up(runs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Return medians and quartiles over the seeds of one variant: one row of `arms.csv`.
 
     Args:
-        runs: Stored runs with `area_in_time`, which a run lacks (None) without a run of the
-            baseline on the same machine. The result `timed` counts the runs that have it; only
-            these are used for measures of time.
+        runs: Stored runs of the variant. Their `area_in_time` is None if the baseline has no run on
+            the same machine. Such runs are excluded from the measures of time; `timed` in the
+            result counts the others.
     """
     first, name_of_steps = runs[0], f'steps_to_{GOOD_SUCCESS}'
     timed = [run for run in runs if run['area_in_time'] is not None]
@@ -166,10 +169,10 @@ def _quartiles(name: str, values: Sequence[float]) -> dict[str, float | str]:
 
 
 def is_significant(arm: Mapping[str, Any], baseline: Mapping[str, Any], name: str) -> bool:
-    """Return whether two variants differ: disjoint quartiles and p of at most .05.
+    """Return whether two variants differ in the measure `name`: quartile ranges disjoint, p <= .05.
 
-    Disjoint quartiles alone are too weak a test: two equal variants of five seeds have them in 52
-    of the 252 possible orders.
+    Disjoint ranges alone are too weak a test: two equal variants of five seeds have them in 52 of
+    the 252 possible orders. `arm` and `baseline` are rows of `arms.csv`.
     """
     below = arm[f'{name}_upper'] < baseline[f'{name}_lower']
     above = baseline[f'{name}_upper'] < arm[f'{name}_lower']
@@ -179,7 +182,7 @@ def is_significant(arm: Mapping[str, Any], baseline: Mapping[str, Any], name: st
 def compared(
     runs: Sequence[Mapping[str, Any]], baseline: Sequence[Mapping[str, Any]]
 ) -> dict[str, float | str]:
-    """Return the p-value of each measure against the baseline as `<name>_p`; empty without runs."""
+    """Return `<measure>_p`, the p-values against the baseline; '' if a group lacks the measure."""
     found: dict[str, float | str] = {}
     for name in COMPARED:
         first, second = (

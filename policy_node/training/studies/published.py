@@ -1,4 +1,4 @@
-"""Tables of shipped actors, and published success rates beside which results are shown.
+"""Tables of shipped actors, and published success rates to compare them with.
 
 The paper gives curves but no numbers. So `RERUN` contains results of others, who ran its code and
 configuration again at about its budget. `BEST` contains the best known results of any method.

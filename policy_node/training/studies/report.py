@@ -49,7 +49,7 @@ class Band:
 
 
 def write_study(study: Study, output: Path) -> None:
-    """Write the tables and the figure of a study from the runs in its folder.
+    """Write the tables and the figure of a study from its runs; nothing without runs.
 
     `arms.csv` holds medians and quartiles. `README.md` keeps what the user wrote around its table.
 
@@ -108,8 +108,8 @@ def _timed(run: Run, seconds: Mapping[str, float]) -> Run:
     """Return a run with `area_in_time`, its mean success in the time that the baseline needs.
 
     Args:
-        seconds: Median processor time of the baseline, by machine. For a run on another machine,
-            `area_in_time` becomes None.
+        seconds: Median processor time of the baseline, by machine. If the machine of `run` is
+            missing here, `area_in_time` becomes None.
     """
     known = seconds.get(run['machine'])
     return {**run, 'area_in_time': None if known is None else area_in_time(run, known)}
@@ -173,7 +173,11 @@ def _times(row: Mapping[str, Any]) -> tuple[str, str, str]:
 
 
 def _against(study: Study, row: Mapping[str, Any], arms: Sequence[Mapping[str, Any]]) -> str:
-    """Return the table cell that compares a variant with the baseline."""
+    """Return the table cell with the measures in which a variant is better or worse.
+
+    Only significant differences from the baseline count. With fewer than five seeds, the cell
+    contains a note instead. The cell is empty for the baseline, or if the baseline has no runs.
+    """
     base = study.arms[0].name
     found = [other for other in arms if (other['task'], other['arm']) == (row['task'], base)]
     if row['arm'] == base or not found:
@@ -199,7 +203,10 @@ def _quartiles(row: Mapping[str, Any], name: str) -> str:
 
 
 def _with_table(page: str, table: str) -> bytes:
-    """Return a page with `table` between its marks; without marks it is unchanged."""
+    """Return the text of a page with `table` between the lines `BEGIN` and `END`, as bytes.
+
+    A page without these lines stays unchanged; an empty page gets both.
+    """
     text = page or f'{BEGIN}\n{END}\n'
     if BEGIN in text and END in text:
         before, after = text.split(BEGIN)[0], text.split(END, 1)[1]
@@ -210,10 +217,11 @@ def _with_table(page: str, table: str) -> bytes:
 def draw(bands: Bands, labels: Mapping[str, str]) -> bytes:
     """Return a PNG with the median and the quartiles of each variant.
 
-    A task has one panel. If it has more than `_MOST_LINES` variants, each variant has a panel of
-    its own, which also shows the first variant, the baseline.
+    A task has one panel for up to five variants. With more variants, each has a panel of its own,
+    which also shows the first variant, the baseline.
 
     Args:
+        bands: Median and quartiles by task and variant.
         labels: Label of each variant, the baseline first. The order determines the colours.
     """
     from matplotlib.figure import Figure

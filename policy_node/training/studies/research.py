@@ -107,8 +107,9 @@ def _paper_settings(task: str) -> dict[str, Any]:
     Fetch tasks have 1.2 % (FetchReach) or 32 % of the paper's steps and smaller batches. One
     collection of 76 episodes replaces two of 38, with twice the updates. Targets move every 10
     updates instead of 40, because a run has few updates. Hand tasks use the recipe `best`, which
-    learns in a million steps what the paper's recipe learns in many millions. Long runs compute in
-    bfloat16, except those of hand tasks that began on a processor without it.
+    learns in a million steps what the paper's recipe learns in many millions. Three hand
+    tasks and all Fetch tasks but FetchReach compute in bfloat16. The other hand tasks compute in
+    float32, as their stored runs did.
     """
     if not task.startswith('Fetch'):
         return HAND if task in _IN_BFLOAT16 else {**HAND, 'precision': 'float32'}
@@ -136,7 +137,7 @@ def _returns() -> Iterator[Arm]:
 
 
 def _targets() -> Iterator[Arm]:
-    """Yield variants with target networks, and without them for each normalisation."""
+    """Yield variants with target networks, and without them for each critic normalisation."""
     slow: dict[str, Any] = {'target': 'polyak', 'target_update_interval': 10}
     for updates in (10, 1, 4, 40):
         label = f'target moves every {updates} updates'

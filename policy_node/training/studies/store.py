@@ -25,7 +25,7 @@ Runs = dict[tuple[str, str, int], Run]
 
 
 def read_runs(folder: Path) -> Runs:
-    """Read the runs of a report folder; the result is empty without a file `runs.jsonl`.
+    """Return the runs of a report folder by task, variant and seed; empty without `runs.jsonl`.
 
     Raises:
         ValueError: If a line of the file is no run.
@@ -69,7 +69,7 @@ def in_order(runs: Iterable[Run], study: Study) -> list[Run]:
 
 
 def holds(runs: Runs, job: Job) -> bool:
-    """Return whether `runs` has this job with equal configuration and final episodes."""
+    """Return whether `runs` has this job, with equal configuration and number of final episodes."""
     run = runs.get(job.key)
     if run is None or run['final_episodes'] != job.final_episodes:
         return False

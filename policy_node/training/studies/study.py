@@ -218,7 +218,7 @@ class Job:
 
     @property
     def is_trained(self) -> bool:
-        """True if the training state has all steps; the log may already contain later rows."""
+        """True if the training state, which may be older than the log, has all steps."""
         if not self.has_checkpoint:
             return False
         return read_counters(self.folder / STATE_FILE).env_steps >= self.config.total_steps

@@ -110,7 +110,10 @@ def _print(text: str) -> None:
 
 
 def attempt(job: Job, report: Path, command: str) -> int:
-    """Train or continue a job, measure it, store the measures and return the exit status."""
+    """Train or continue a job, measure it, store the measures and return the exit status.
+
+    The status is `TAKEN` if another process trains the job, or 128 + number of a stop signal.
+    """
     try:
         # Another process may have finished the job meanwhile.
         if is_finished(job, report):
