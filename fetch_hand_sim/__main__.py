@@ -99,7 +99,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _explain(words: Sequence[str]) -> int:
-    """Print help, version, completion script or an error for `words`; argparse then exits."""
+    """Let argparse print help, version, completion script or an error for `words`, and exit."""
     try:
         make_parser().parse_args(words)
         return EXIT_USAGE

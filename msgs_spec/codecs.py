@@ -26,13 +26,13 @@ _ANSWER_LABEL = re.compile(r'answers ([0-9]{19})')
 
 
 def message_stamp(message: Any) -> int:
-    """Return the stamp, ns, of a message with a header or of a Clock; errors as in `stamp_of`."""
+    """Return the stamp, ns, of a stamped message or a Clock; ValueError if nanosec >= 10^9."""
     stamp = message.header.stamp if hasattr(message, 'header') else message.clock
     return stamp_of(int(stamp.sec), int(stamp.nanosec))
 
 
 def stamp_of(seconds: int, nanoseconds: int) -> int:
-    """Combine the fields of a stamp to ns; raise ValueError unless `nanoseconds` < 10^9."""
+    """Combine the two fields of a stamp to ns; raise ValueError if `nanoseconds` >= 10^9."""
     if nanoseconds >= _NANOSECONDS:
         raise ValueError(f'stamp with nanosec {nanoseconds}; allowed: less than {_NANOSECONDS}')
     return seconds * _NANOSECONDS + nanoseconds
@@ -366,7 +366,7 @@ class TopicCodec:
         return runs
 
     def _slot(self, marker: float) -> int:
-        """Return the position of `marker` in the template, in float64s after the CDR header."""
+        """Return the index of the number `marker` among the float64s of the template message."""
         pattern = _FLOAT.pack(marker)
         offset = self._template.find(pattern) - _BODY
         if self._template.count(pattern) != 1 or offset % _FLOAT.size:

@@ -62,7 +62,7 @@ class Kind:
         return (numbers[0], numbers[-1]) if self.is_range else numbers[0]
 
     def scaled(self, value: Any, strength: float) -> Any:
-        """Return `value` made `strength` times as strong, between `lowest` and `highest`."""
+        """Return `off + strength * (value - off)`, for factors `value ** strength`, clipped."""
         if isinstance(value, tuple):
             return tuple(self.scaled(each, strength) for each in value)
         change = strength * (value - self.off)
@@ -95,7 +95,7 @@ def _off(kind: Kind) -> Any:
 
 @dataclass(frozen=True)
 class _Group:
-    """Base class of the groups; checks each field, and turns a range given as n into (n, n)."""
+    """Base class of groups such as `PushDisturbance`; checks fields, turns ranges n into (n, n)."""
 
     def __post_init__(self) -> None:
         for each in fields(self):

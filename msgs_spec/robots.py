@@ -200,7 +200,7 @@ def action_from_command(robot: RobotSpec, command: ArrayLike) -> Array:
 
 
 def resting_command(robot: RobotSpec) -> Array:
-    """Return the command of action 0: the gripper stays, hand joints move to mid-range."""
+    """Return the command of action 0: Fetch stays where it is; hand joints move to mid-range."""
     return np.asarray(command_from_action(robot, np.zeros(robot.action_size)), dtype=np.float64)
 
 

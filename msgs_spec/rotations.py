@@ -2,7 +2,7 @@
 
 Quaternions are wxyz as in MuJoCo; only ROS messages contain xyzw. All functions work on new
 contiguous arrays and element by element, so a batch gives the same bits as one call per row. Euler
-angles follow the relative xyz convention of `gymnasium_robotics.utils.rotations`.
+angles are intrinsic (relative) xyz, as in `gymnasium_robotics.utils.rotations`.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ def quaternion_to_matrix(quaternion: ArrayLike) -> Array:
 
 
 def matrix_to_euler(matrix: ArrayLike) -> Array:
-    """Return Euler angles xyz (..., 3), rad, of rotation matrices (..., 3, 3)."""
+    """Return intrinsic Euler angles xyz (..., 3), rad, of rotation matrices (..., 3, 3)."""
     values = np.asarray(matrix, dtype=np.float64)
     m = np.ascontiguousarray(np.moveaxis(values, (-2, -1), (0, 1)))
     cy = np.sqrt(m[2, 2] * m[2, 2] + m[1, 2] * m[1, 2])
@@ -96,7 +96,7 @@ def matrix_to_euler(matrix: ArrayLike) -> Array:
 
 
 def euler_to_quaternion(euler: ArrayLike) -> Array:
-    """Return quaternions wxyz (..., 4) of Euler angles xyz (..., 3), rad."""
+    """Return quaternions qx qy qz, wxyz (..., 4), of intrinsic Euler angles xyz (..., 3), rad."""
     x, y, z = _parts(euler)
     ai, aj, ak = z / 2, -y / 2, x / 2
     si, sj, sk = np.sin(ai), np.sin(aj), np.sin(ak)
@@ -108,7 +108,7 @@ def euler_to_quaternion(euler: ArrayLike) -> Array:
 
 
 def quaternion_to_euler(quaternion: ArrayLike) -> Array:
-    """Return Euler angles xyz (..., 3), rad, of quaternions wxyz (..., 4) of any norm."""
+    """Return intrinsic Euler angles xyz (..., 3), rad, of quaternions wxyz (..., 4) of any norm."""
     w, x, y, z = _parts(quaternion)
     norm = w * w + x * x + y * y + z * z
     scale = 2.0 / np.where(norm > 0.0, norm, 1.0)

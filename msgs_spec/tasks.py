@@ -270,7 +270,7 @@ def task_spec(
     """Return a task by name; raise ValueError, which lists all tasks, if it is unknown.
 
     Args:
-        joint_prefix: Prefix of the joint names on the network.
+        joint_prefix: Prefix of the joint names in ROS messages.
         control_hz: Action frequency, Hz. Episodes have the same duration at all frequencies; the
             number of steps is rounded.
     """

@@ -23,7 +23,7 @@ def did_you_mean(given: str, allowed: Iterable[str] | Mapping[str, str]) -> str:
 
 
 def one_of(given: object, allowed: Sequence[Name], meaning: str) -> Name:
-    """Return `given` if it is allowed; raise ValueError, which begins with `meaning`, otherwise."""
+    """Return `given` if it is in `allowed`; else raise ValueError `<meaning> ...; allowed: ...`."""
     for name in allowed:
         if given == name:
             return name
@@ -33,9 +33,9 @@ def one_of(given: object, allowed: Sequence[Name], meaning: str) -> Name:
 
 
 def entries(owner: str, values: Any, allowed: Sequence[str]) -> dict[str, Any]:
-    """Return the mapping `values`, which errors call `owner`, as a dictionary.
+    """Return the mapping `values` as a dictionary, if all its keys are in `allowed`.
 
-    Another type, or a key that is not in `allowed`, raises ValueError.
+    Otherwise, or for another type, raise ValueError; the message calls the mapping `owner`.
     """
     if not isinstance(values, Mapping):
         raise ValueError(

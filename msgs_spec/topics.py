@@ -326,7 +326,7 @@ SHOWN = (
 
 
 def _scalar(name: str, unit: str, text: str) -> TopicSpec:
-    """Return topic `scalars/<name>`, a number in `x` of a vector: ROS has no stamped number."""
+    """Return topic `scalars/<name>`, a number in `vector.x` of a `Vector3Stamped` message."""
     layout = (VectorPart(name, 1, unit),)
     return TopicSpec(f'{_SCALARS}{name}', 'geometry_msgs/msg/Vector3Stamped', text, layout)
 

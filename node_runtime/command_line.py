@@ -1,4 +1,4 @@
-"""Command lines: one-line errors, exit codes, optional dependencies, progress bars.
+"""Run commands: print one-line errors, return exit codes, check extras and show progress.
 
 `run_command` is the one place where errors become exit codes.
 """
@@ -66,7 +66,7 @@ class UsageError(CommandError):
 def usage_errors(
     errors: type[Exception] | tuple[type[Exception], ...] = ValueError, prefix: str = ''
 ) -> Iterator[None]:
-    """Raise `errors` of the block as `UsageError`, with `prefix` before the message."""
+    """Convert `errors` raised in the `with` block to `UsageError`; `prefix` starts its message."""
     try:
         yield
     except errors as error:
@@ -111,7 +111,7 @@ class CommandParser(argparse.ArgumentParser):
 
 
 def whole_number(lower: int, upper: int | None = None) -> Callable[[str], int]:
-    """Return a parser of whole numbers from `lower` to `upper`, for `add_argument(type=...)`."""
+    """Return a parser of integers `lower` ... `upper` (None: no limit), for `type` of an option."""
     allowed = f'whole numbers {f"from {lower}" if upper is None else f"{lower} ... {upper}"}'
 
     def read(text: str) -> int:
@@ -157,7 +157,7 @@ def run_command(name: str, run: Callable[[], int]) -> int:
 
     Returns:
         The result of `run`; 2 for a `UsageError`; 1 for another `CommandError` or a full disk; 141
-        for a closed output; 130, 143 or 129 for SIGINT, SIGTERM or SIGHUP, after `stopping`.
+        for a closed output; 130, 143 or 129 after SIGINT, SIGTERM or SIGHUP.
     """
     make_output_usable()
 
@@ -214,7 +214,7 @@ def _ignores_interrupt() -> bool:
 def make_output_usable() -> None:
     """Replace a missing stdout or stderr, and escape characters that their encoding lacks.
 
-    Does nothing if the program has its own handler of SIGINT.
+    Does nothing in a program with its own SIGINT handler, which called the command as a function.
     """
     if not (has_default_interrupt() or _ignores_interrupt()):
         return

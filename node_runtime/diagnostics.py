@@ -33,9 +33,9 @@ _LATEST = (2**31 - 1) * 10**9
 
 
 def next_report(due: float, now: float) -> float:
-    """Return the time at which the next report is due; `due` is the time of the present one.
+    """Return when the next report is due: a period after `due`, the time of the present one.
 
-    Times are seconds of a steady clock. After a missed report, a whole period follows `now`.
+    Times are seconds of a steady clock. If that time has passed, return a period after `now`.
     """
     return due + REPORT_PERIOD if due + REPORT_PERIOD > now else now + REPORT_PERIOD
 

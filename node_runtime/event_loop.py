@@ -43,11 +43,10 @@ class EventLoop:
         self._announce_after_suspension()
 
     def serve_pending(self, limit: int) -> None:
-        """Run the callbacks that are waiting now, without those that arrive meanwhile.
+        """Run the callbacks that are waiting now, at most `limit`.
 
-        Args:
-            limit: Maximum number of callbacks. It is no time limit, so that the result does not
-                depend on the load of the machine.
+        Callbacks that arrive meanwhile do not run, except with SingleThreadedExecutor (at most 10
+        callbacks). A limit of time would make the result depend on the load of the machine.
         """
         self._announce_after_suspension()
         if not self._is_queue:

@@ -131,7 +131,7 @@ def node_main(
 def destroy(node: Node, exit_code: int | None = None) -> None:
     """Destroy a node; end the process with `exit_code` if that takes longer than 10 s.
 
-    Without `exit_code`, the code follows from the exception being handled; 0 if there is none.
+    The default code is 0; while an exception is handled, it is the exception's `exit_code`, or 1.
     """
     error = sys.exception()
     if exit_code is None:
@@ -146,8 +146,7 @@ def ends_within(seconds: float, exit_code: int) -> Iterator[None]:
 
     Fast DDS 2.14 can spin for minutes while a participant is deleted (eProsima/Fast-DDS issue
     6513), and rclpy holds the interpreter meanwhile. No Python thread or signal handler runs then,
-    but a timer of the C library does. `faulthandler.dump_traceback_later` would work too, but its
-    exit code is always 1. Stdout and stderr are flushed before the block. Works with glibc only.
+    but a timer of the C library does. Flushes stdout and stderr before the block. Needs glibc.
     """
     for stream in filter(None, (sys.stdout, sys.stderr)):
         with suppress(OSError, ValueError):
@@ -224,9 +223,9 @@ def run_node(
 
 
 def find_place_for_logs(environment: MutableMapping[str, str] = os.environ) -> None:
-    """Set an unset `ROS_LOG_DIR` to the temporary folder if the home directory is not writable.
+    """Set `ROS_LOG_DIR` to the temporary folder if the home directory is not writable.
 
-    Without a writable folder for logs, as in many containers, ROS starts no node.
+    Do nothing if `ROS_LOG_DIR` or `ROS_HOME` is set. ROS starts no node if it cannot write logs.
     """
     if any(map(environment.get, ('ROS_LOG_DIR', 'ROS_HOME'))):
         return
@@ -255,7 +254,7 @@ def _initialise(init: Callable[..., None], args: list[str] | None, handlers: Any
 
 
 def _reject_arguments(args: Sequence[str]) -> None:
-    """Raise UsageError for arguments that rclpy would ignore or reject without a reason."""
+    """Raise UsageError for arguments outside `--ros-args`, empty parameters and invalid names."""
     inside = False
     for before, arg in pairwise(['', *args]):
         if arg == '--ros-args':

@@ -36,16 +36,16 @@ _PATIENCE = 6.0
 
 
 def seldom(seconds: float) -> dict[str, Any]:
-    """Return arguments that make a logger print a line at most once in `seconds`.
+    """Return logger arguments that print a line at most once in `seconds` of a steady clock.
 
-    The default, the system clock, would suppress the line for long after the clock is set back.
+    With the system clock, rclpy's default, no line would appear for long after it is set back.
     """
     return {'throttle_duration_sec': seconds, 'throttle_time_source_type': _steady_clock()}
 
 
 @cache
 def _steady_clock() -> Clock:
-    """Return a clock, always the same: a log call may not change the clock that limits its rate."""
+    """Return the same steady clock in all calls; rclpy forbids a log call to change its clock."""
     from rclpy.clock import Clock
     from rclpy.clock_type import ClockType
 
@@ -135,7 +135,7 @@ class SubscriberWatch:
         self._changed_at = 0.0
 
     def expect_more(self) -> None:
-        """Make `are_connected` wait for the subscriptions of a node that has just appeared."""
+        """Make `are_connected` return False for 0.2 s, as a new node may soon subscribe."""
         self._changed_at = time.monotonic()
 
     def update(self) -> bool:

@@ -73,10 +73,10 @@ def on_stop_signals(
     stop: Callable[[int, FrameType | None], None],
     raises_again: bool = False,
 ) -> Iterator[list[int]]:
-    """Call `stop` when a signal arrives in the block; its repetition has the default effect.
+    """Context manager that calls `stop` at the first signal of each kind; yields their numbers.
 
-    A closed terminal sends SIGHUP twice, so a second SIGHUP is ignored. Yields the list of the
-    received signal numbers.
+    A second signal of a kind ends the process. A second SIGHUP is ignored, because a closed
+    terminal sends two. The list of numbers grows as signals arrive.
 
     Args:
         numbers: Signals to handle.
@@ -106,9 +106,9 @@ def on_stop_signals(
 
 
 def available_signals(numbers: Iterable[signal.Signals]) -> list[signal.Signals]:
-    """Return the signals that this thread may handle.
+    """Return the signals that this thread may handle: none outside of the main thread.
 
-    Python delivers signals to the main thread only, and `nohup` ignores SIGHUP.
+    SIGHUP is excluded if the process ignores it, as under `nohup`.
     """
     if threading.current_thread() is not threading.main_thread():
         return []

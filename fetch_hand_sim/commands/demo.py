@@ -79,7 +79,7 @@ class Watcher:
             subscribe(self._node, topic(spec, name), callback)
 
     def others(self) -> str:
-        """Name another process that would interact with the nodes of this demo; '' without one."""
+        """Return what else is running and would disturb the demo, such as `a robot`; '' if none."""
         if count_publishers(self._node, 'episode_status'):
             return 'a robot'
         # Policies that wait for a robot read its status and report diagnostics.

@@ -132,7 +132,7 @@ def _add(path: Path, by_task: dict[str, list[EpisodeArrays]], options: argparse.
 
 
 def _why_left_out(episode: EpisodeArrays, others: Sequence[EpisodeArrays], to: str) -> str:
-    """Return why an episode cannot be in a dataset of format `to` with the others, or ''."""
+    """Return why an episode cannot share a dataset of format `to` with `others`; '' if it can."""
     if to == 'parquet':
         return ''
     if len(episode) == 0:
@@ -141,7 +141,7 @@ def _why_left_out(episode: EpisodeArrays, others: Sequence[EpisodeArrays], to: s
 
 
 def _export(options: argparse.Namespace, by_task: ByTask, name: str) -> dict[str, str]:
-    """Write a dataset for each task; return its location, as text, by task."""
+    """Write a dataset per task (Minari: id from `name`); return its location, as text, by task."""
     if options.to == 'parquet':
         files = export_parquet(by_task, options.output)
         return {task: ', '.join(map(str, paths)) for task, paths in files.items()}

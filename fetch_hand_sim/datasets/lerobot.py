@@ -44,9 +44,8 @@ def export_lerobot(
     Observations, actions and rewards are float32, as LeRobot's policies expect.
 
     Args:
-        by_task: At least one episode of each task. Each has at least one step and can share a
-            dataset with the first one of its task, see `writing.why_apart`.
-        directory: Folder for the datasets.
+        by_task: One or more episodes of each task, with one or more steps. The episodes of a
+            task have the same control rate, timing, reward type and success rule.
         camera: Camera of the films; None writes no films.
 
     Returns:
@@ -68,7 +67,7 @@ def export_lerobot(
 
 @dataclass(frozen=True, slots=True)
 class _Dataset:
-    """Writes the LeRobot dataset of one task into the folder `path`."""
+    """Writes the LeRobot dataset of one task into `path`; `rate` is frames per second."""
 
     path: Path
     spec: TaskSpec
@@ -101,7 +100,7 @@ class _Dataset:
         self._write_json('meta/info.json', self._info(rows))
 
     def _row(self, columns: Columns, where: dict[str, int]) -> Row:
-        """Return an episode's row for `meta/episodes`; `where` numbers its chunk and data file."""
+        """Return a row of `meta/episodes`; `where` has `chunk_index` and `file_index`."""
         index = columns['index']
         return {
             'episode_index': int(columns['episode_index'][0]),
@@ -124,7 +123,8 @@ class _Dataset:
     ) -> list[Histogram]:
         """Write the episodes of one data file as one film; return a colour histogram of each.
 
-        Add to each of `rows` the film file, start and end time of the episode, and its statistics.
+        Add to the row of each episode the chunk and file index of the film (`where`), its start and
+        end time in the film, and the statistics of its colours.
         """
         path = self._file(_FILM, video_key=camera.key, **where)
         colors = write_episodes(path, episodes, camera, self.rate)
@@ -298,7 +298,7 @@ def frames(episode: EpisodeArrays, episode_index: int, first_index: int) -> Colu
 
 
 def statistics(values: NDArray[Any]) -> dict[str, Any]:
-    """Return minimum, maximum, mean and other statistics of a column (n,) or (n, size)."""
+    """Return min, max, mean, std, count and quantiles, by name, of a column (n,) or (n, size)."""
     rows = values.reshape(len(values), -1)
     numbers = rows.astype(np.float64)
     return {
@@ -403,7 +403,7 @@ def color_statistics(histogram: Histogram, pixels: int) -> dict[str, Any]:
 
     Args:
         histogram: (3, 256) number of pixels by colour channel and level.
-        pixels: Number of pixels of a picture.
+        pixels: Number of pixels of a picture, to compute `count`, the number of pictures.
     """
     levels = np.arange(_LEVELS) / (_LEVELS - 1)
     total = int(histogram[0].sum())

@@ -33,11 +33,7 @@ _MINARI_PATH, _NAMESPACE = 'MINARI_DATASETS_PATH', 'namespace_metadata.json'
 
 
 def dataset_name(text: str) -> str:
-    """Check the name of a dataset and return it; `-v0` is appended if it has no version.
-
-    Raises:
-        UsageError: If Minari does not allow the name.
-    """
+    """Return the name of a dataset, with `-v0` if it has no version; UsageError if not allowed."""
     *folders, _ = text.split('/')
     # A folder with a version is a dataset, and Minari finds no dataset within it.
     if not _DATASET_NAME.fullmatch(text) or any(map(_VERSION.search, folders)):
@@ -52,8 +48,8 @@ def export_minari(by_task: ByTask, directory: Path, name: str) -> dict[str, str]
     """Write one Minari dataset for each task.
 
     Args:
-        by_task: At least one episode of each task. Each can share a dataset with the first one of
-            its task, see `writing.why_apart`.
+        by_task: Episodes by task, at least one each. Those of one task have the same control rate,
+            timing, reward type and success rule.
         directory: Folder of the Minari datasets (`MINARI_DATASETS_PATH`).
         name: Name such as `logged-v0` or `me/logged-v0`; the task comes before it.
 
@@ -105,7 +101,7 @@ def _buffers(
 def _create_dataset(
     minari: Any, dataset_id: str, episodes: Sequence[EpisodeArrays], buffers: Iterator[Any]
 ) -> None:
-    """Write one dataset into the folder that the variable `MINARI_DATASETS_PATH` names."""
+    """Write `buffers`, made from `episodes`, as a dataset into the folder MINARI_DATASETS_PATH."""
     # Loads MuJoCo, which other exports do not need.
     from fetch_hand_sim.gym_envs.task_attributes import observation_space
 

@@ -66,7 +66,7 @@ def alone_in(directory: Path) -> Iterator[None]:
 
 @contextmanager
 def appearing(directory: Path, names: Iterable[str]) -> Iterator[Path]:
-    """Yield a hidden folder; move its entries `names` to `directory` at the end of the block.
+    """Yield a hidden folder; if the block succeeds, move its entries `names` to `directory`.
 
     Raises:
         ExportError: If `directory` already contains one of `names`, or the disk fails.

@@ -82,7 +82,7 @@ def load_episodes(
 
 
 def load_episode(path: Path) -> EpisodeArrays:
-    """Load one episode; see `load_episodes`."""
+    """Load a bag directory or an MCAP file; EpisodeReadError if it is not a valid episode."""
     file = read_episode(path)
     with one_line_errors(file.path):
         return _decode(file)
@@ -144,9 +144,10 @@ def stamped_vectors(file: Episode, task: TaskSpec, name: str, stamps: NDArray[np
 def _unstamped_vectors(
     file: Episode, task: TaskSpec, name: str, stamps: NDArray[np.int64], first: int
 ) -> Array:
-    """Return the vectors of a topic without header stamps, from tick `first` on.
+    """Return the vectors of a topic without header stamps, from tick `first` to the last tick.
 
-    The log time of a message determines its tick; ValueError if one is missing.
+    `stamps` contains the stamps of all ticks. The log time of a message, compared with them,
+    determines its tick; ValueError if a tick has no message.
     """
     count = len(stamps) - first
     if not count:

@@ -59,7 +59,7 @@ class Attachment:
 
 @cache
 def offered_qos(spec: QosSpec) -> list[dict[str, Any]]:
-    """Return the QoS profile of one publisher, with the keys that rosbag2 writes."""
+    """Return a list with one QoS profile, `spec` with all keys that rosbag2 writes."""
     return [
         {
             'history': 'keep_last',
@@ -77,12 +77,12 @@ def offered_qos(spec: QosSpec) -> list[dict[str, Any]]:
 
 @cache
 def offered_qos_text(spec: QosSpec) -> str:
-    """Return the QoS profile of one publisher as YAML text, as a channel of the file records it."""
+    """Return `offered_qos` as YAML text, the value `offered_qos_profiles` of a channel."""
     return yaml.safe_dump(offered_qos(spec), sort_keys=False)
 
 
 def checked_strings(content: Mapping[str, str]) -> dict[str, str]:
-    """Copy a metadata record; ValueError if it exceeds the limits of entries or bytes."""
+    """Copy a metadata record; ValueError above `MAX_METADATA_BYTES` or `MAX_MAP_ENTRIES`."""
     size = sum(len(text.encode()) for item in content.items() for text in item)
     if size > MAX_METADATA_BYTES:
         raise ValueError(f'{size} bytes of episode metadata; allowed: {MAX_METADATA_BYTES}')
@@ -149,8 +149,8 @@ class BagFile:
         Sequence numbers count the messages of a topic from 0, so a gap is visible.
 
         Raises:
-            OSError: If the message exceeds the limits of a file, or the stream fails. In the first
-                case all earlier messages are flushed.
+            OSError: If the stream fails, `has_room` is False, or topics would exceed `MAX_TOPICS`.
+                If `has_room` is False, all earlier messages are flushed first.
         """
         if not self.has_room(len(data)):
             self.flush()
@@ -171,7 +171,7 @@ class BagFile:
         return self._flushes + self._bytes // CHUNK_BYTES + 1
 
     def has_room(self, size: int) -> bool:
-        """Return whether the file stays within its limits with another message of `size` bytes."""
+        """Return whether a message of `size` bytes fits: limits of messages, bytes and chunks."""
         return (
             size <= MAX_MESSAGE_BYTES
             and self.message_count < MAX_MESSAGES
@@ -186,7 +186,7 @@ class BagFile:
         self._writer.flush()  # type: ignore[no-untyped-call]
 
     def finish(self, result: dict[str, str]) -> str:
-        """Write the last chunk, the result and the summary; return the text of `metadata.yaml`."""
+        """Write last chunk, metadata record `result`, summary; return text of `metadata.yaml`."""
         self.flush()
         custom_data = {**self._metadata, **result}
         self._writer.add_metadata(EPISODE_RESULT, result)

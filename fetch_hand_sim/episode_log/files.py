@@ -166,7 +166,7 @@ def read_each(
     read: Callable[[Path], Read],
     on_skip: Callable[[EpisodeReadError], object] | None = None,
 ) -> Iterator[Read]:
-    """Yield `read(path)` for each path; pass EpisodeReadError to `on_skip`, or raise it without."""
+    """Yield `read(path)` for each path; pass EpisodeReadError to `on_skip`, or raise it if None."""
     for path in paths:
         try:
             result = read(path)

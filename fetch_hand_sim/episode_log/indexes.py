@@ -152,7 +152,7 @@ def _check_offsets(data: bytes, summary: Summary) -> None:
 
 
 def _check_record_indexes(data: bytes, summary: Summary, contents: Contents) -> None:
-    """Check that the index of metadata, and that of attachments, is missing or complete."""
+    """Raise ValueError if the index of metadata or attachments is incomplete, but not missing."""
     for what, opcode, expected in (
         ('metadata', Opcode.METADATA_INDEX, [each.index for each in contents.metadata]),
         ('attachments', Opcode.ATTACHMENT_INDEX, [each.index for each in contents.attachments]),
@@ -201,7 +201,7 @@ def _check_chunk_indexes(
 
 
 def _check_chunk_times(contents: Contents, messages: Messages) -> None:
-    """Raise ValueError if the times in a chunk header are neither 0 nor those of its messages."""
+    """Raise ValueError if a chunk header has other times than its messages; 0, 0 is allowed."""
     order = np.argsort(messages.starts)
     starts, times = messages.starts[order], messages.headers['log_time'][order]
     for chunk in contents.chunks:
@@ -213,7 +213,7 @@ def _check_chunk_times(contents: Contents, messages: Messages) -> None:
 
 
 def _check_message_indexes(contents: Contents, messages: Messages) -> None:
-    """Check that the message indexes are missing, or list all messages."""
+    """Raise ValueError if the file has message indexes that do not list exactly its messages."""
     if not contents.message_indexes:
         return
     found = contents.message_indexes
@@ -236,7 +236,7 @@ def _check_message_indexes(contents: Contents, messages: Messages) -> None:
 def _check_statistics(
     data: bytes, summary: Summary, contents: Contents, messages: Messages
 ) -> None:
-    """Raise ValueError for wrong counts or log times; all counts but those of messages may be 0."""
+    """Raise ValueError if the statistics are wrong; counts other than that of messages may be 0."""
     if len(summary[Opcode.STATISTICS]) > 1:
         raise ValueError('ambiguous: two records of statistics')
     for position, end in summary[Opcode.STATISTICS]:

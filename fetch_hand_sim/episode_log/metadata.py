@@ -101,8 +101,8 @@ class EpisodeOutcome:
     """Contents of the metadata record `episode_result`; None for missing values.
 
     Attributes:
-        received_not_logged: Number of received messages, by topic, that exceeded a limit and so
-            were not logged.
+        received_not_logged: Number of messages left out of the file, which limits their number and
+            bytes, by topic; `<topic> (refused)` counts messages that the robot rejected.
         late_commands: Steps whose command was not computed from the observation right before; None
             in lockstep, in generated episodes and in files of interface version 1.
     """

@@ -135,8 +135,8 @@ def read_episode(path: Path | str) -> Episode:
     """Read and check an episode; `path` is a bag directory or an MCAP file.
 
     Raises:
-        EpisodeReadError: If the file is missing, damaged, ambiguous or not an episode, or has a
-            topic that its task does not have.
+        EpisodeReadError: If the file is missing, damaged or no episode, if its parts contradict
+            each other, or if it has a topic that its task does not have.
     """
     file = files.mcap_file(Path(path))
     with one_line_errors(file):

@@ -182,7 +182,7 @@ class Chunk:
 class MessageIndex(NamedTuple):
     """A message index record of MCAP: log time and offset of the messages of a channel in a chunk.
 
-    `chunk` is a number in `Contents.chunks`, `position` the byte offset of the record in the file.
+    `chunk` is an index of `Contents.chunks`, `position` the byte offset of the record in the file.
     """
 
     chunk: int
@@ -429,10 +429,11 @@ class Messages:
 
 
 def split_records(data: bytes) -> Iterator[tuple[int, int, int]]:
-    """Yield opcode, start and end (byte offsets) of each record of a file, from its header on.
+    """Yield opcode, start and end of each record of a file, beginning with the header record.
 
-    A missing header, a cut-off record and more than `MAX_RECORDS` records raise ValueError. The
-    caller removes the magic bytes at the end from `data`, or stops at the footer.
+    `data[start:end]` is the whole record. A missing header, a cut-off record and more than
+    `MAX_RECORDS` records raise ValueError. The caller removes the magic bytes at the end of `data`,
+    or stops at the footer.
     """
     magic = len(MCAP0_MAGIC)
     if data[:magic] != MCAP0_MAGIC:

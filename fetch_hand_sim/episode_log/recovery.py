@@ -137,8 +137,8 @@ def recover_episode(leftover: Path | str) -> Path | None:
 
     Raises:
         EpisodeInUseError: If another process writes, recovers or has recovered the episode.
-        EpisodeLogError: If the episode is ambiguous or not written by this package, a finished
-            episode has its name, or the disk fails. The episode stays unfinished then.
+        EpisodeLogError: If the file is ambiguous (such as two episodes), is not of this package, a
+            finished episode has its name, or the disk fails. The episode stays unfinished then.
     """
     leftover = Path(leftover)
     name = files.active_name(leftover)

@@ -129,7 +129,7 @@ class EpisodeWriter:
             raise EpisodeLogError(f'cannot log episode {self._final}: {_reason(error)}') from error
 
     def write_tick(self, stamp_ns: int, messages: Iterable[tuple[TopicSpec, bytes]]) -> bool:
-        """Append the messages (topic, CDR bytes) of a tick; return False if writing has stopped.
+        """Append the messages (topic, CDR bytes) of a tick; return False after an error or `end`.
 
         Raises:
             EpisodeLogError: At the first disk error, or if the episode is too long. The part
@@ -146,10 +146,11 @@ class EpisodeWriter:
     def write_received(self, topic: TopicSpec, data: bytes, *, is_refused: bool = False) -> bool:
         """Append a message received since the last tick; return whether it is logged.
 
-        `is_refused` marks messages that the robot rejected, which have a lower limit.
+        Returns False beyond the limits of `ReceivedAllowance` or of the file, after an error, or
+        after `end`. `is_refused` marks messages that the robot rejected; half of the limits apply.
 
         Raises:
-            EpisodeLogError: As in `write_tick`.
+            EpisodeLogError: At the first disk error.
             ValueError: Before the first tick: earlier messages are not part of the episode.
         """
         if not self._is_open:
@@ -175,7 +176,7 @@ class EpisodeWriter:
         return self._is_open and self._bag.has_unflushed
 
     def finish(self, result: Mapping[str, str], reason: str | None = None) -> Path | None:
-        """Complete the bag and return its directory, or None without messages or after an error.
+        """Complete the bag; return its directory, None without messages or after an earlier error.
 
         If the bag cannot be completed, EpisodeLogError is raised and the hidden directory stays.
 
@@ -187,10 +188,10 @@ class EpisodeWriter:
         return self.store()
 
     def end(self, result: Mapping[str, str], reason: str | None = None) -> bool:
-        """Do the first half of `finish`: write the last messages, the result and the summary.
+        """Write the last messages, the result and the summary, so that `store` can follow.
 
-        If the process is killed after this, recovery finds the whole episode. Returns False if
-        there is no bag to `store`.
+        If the process is killed before `store`, recovery finds the whole episode. Returns False if
+        there is nothing to store: without messages or after an earlier error.
         """
         record = {**result, 'complete': 'true' if reason is None else 'false'}
         if reason is not None:
@@ -211,7 +212,7 @@ class EpisodeWriter:
         return True
 
     def store(self) -> Path | None:
-        """Do the second half of `finish`: fsync and rename; return the bag's directory, or None."""
+        """Sync and rename the bag after `end`; return its directory, or None if there is no bag."""
         if self._description is None:
             return self._completed
         try:
@@ -249,7 +250,7 @@ class EpisodeWriter:
         return EpisodeLogError(f'episode log stopped, {self._stream.name}: {_reason(error)}')
 
     def _stop(self) -> None:
-        """Close the stream, which releases the lock."""
+        """Close the MCAP file, which releases the lock that marks it as being written."""
         self._is_open = False
         with suppress(OSError):
             self._stream.close()

@@ -111,9 +111,9 @@ class CheckResult:
 
 @lru_cache(maxsize=1)
 def _reference(task: str, **rules: Any) -> tuple[Simulation, RecordingContext, str]:
-    """Return simulation, recording context and version 1.0 model hash, to check an episode with.
+    """Return (simulation, recording context, old model hash) to compare an episode with.
 
-    The hash is that of `former_model_sha256`, which episodes of version 1.0 contain. `rules` are
+    The hash is `former_model_sha256` of the model, which files of version 1.0 contain. `rules` are
     arguments of `Simulation`. The last result is cached: most episodes of a folder share settings.
     """
     simulation = Simulation(task, num_threads=1, **rules)
@@ -263,7 +263,7 @@ def _differences(
 
 
 def _require_goals(episode: Episode) -> None:
-    """Raise `ValueError` if the robot received goals or pushes that the file lacks."""
+    """Raise `ValueError` if, by its metadata, the file lacks goals or pushes sent to the robot."""
     for name in ('set_goal', 'perturb'):
         if name in episode.outcome.received_not_logged:
             raise ValueError(f'the file lacks some of the received messages of {name}')
@@ -317,7 +317,10 @@ class _Received:
         self._lacks_commands = is_recovered or bool(_COMMANDS & outcome.received_not_logged.keys())
 
     def differences(self, number: int, command: Array) -> Iterator[tuple[str, object, object]]:
-        """Yield (field, applied, received) if `command` of tick `number` was not received last."""
+        """Yield (field, applied, received) if the robot applied another command than it received.
+
+        `command` was applied at tick `number`. Yield nothing without a command since the last tick.
+        """
         if not number:
             self._commands.start_episode(self._runner.resting_command())
         if not self._lacks_commands and self._commands.has_fresh_command:
@@ -349,7 +352,11 @@ def _tick_differences(
     stamp_ns: int,
     expected: list[tuple[TopicSpec, bytes]],
 ) -> Iterator[tuple[str, object, object]]:
-    """Yield (field, recorded value, simulated value) for differences in the messages of a tick."""
+    """Yield (field, recorded value, simulated value) for differences in the messages of a tick.
+
+    `expected` are the simulated published messages; `received` are logged messages from other
+    nodes. Log times of all messages count up from `stamp_ns`.
+    """
     names = [message.topic.name for message in logged.published]
     wanted = [topic.name for topic, _ in expected]
     for index, (name, other) in enumerate(zip_longest(names, wanted, fillvalue='nothing')):
@@ -366,7 +373,7 @@ def _tick_differences(
 
 
 def _field_difference(topic: TopicSpec, recorded: bytes, simulated: bytes) -> tuple[str, str, str]:
-    """Return the first field in which two messages differ, with both values as text."""
+    """Return (field, recorded, simulated) of the first differing field; '' if only bytes differ."""
     try:
         first, second = (deserialize(topic.type_name, data) for data in (recorded, simulated))
     except ValueError:

@@ -83,7 +83,7 @@ class CommandBuffer:
 
         Args:
             values: (action size,) in the order of the robot's commands, command units.
-            answered_stamp: Stamp of the observation from which it was computed, nanoseconds.
+            answered_stamp: Stamp of the observation from which the command was computed, ns.
         """
         command = np.asarray(values, dtype=np.float64).ravel()
         size = self._robot.action_size
@@ -92,7 +92,7 @@ class CommandBuffer:
         self._store(command, answered_stamp)
 
     def accept_named(self, names: Sequence[str], positions: ArrayLike) -> None:
-        """Store targets of some joints by name; others keep theirs. ValueError if invalid."""
+        """Store targets of the joints `names`; other targets stay. ValueError if invalid."""
         values = np.asarray(positions, dtype=np.float64).ravel()
         if len(names) != values.size:
             self._reject('wrong size', f'{len(names)} names but {values.size} positions given')

@@ -76,8 +76,8 @@ class EpisodeGenerator:
     def generate(self, episodes: int, first_seed: int = 0) -> Iterator[LoggedEpisode]:
         """Yield the logged episodes, in order, as their files are completed.
 
-        Episode i has the seed `first_seed + i`. Its stamps are those of one robot that runs all
-        episodes one after the other.
+        Episode i has the seed `first_seed + i`. The stamps are as if one robot ran all
+        episodes, one after the other.
 
         Raises:
             EpisodeLogError: If a file cannot be written.

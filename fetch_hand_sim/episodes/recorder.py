@@ -109,7 +109,10 @@ class RecordingContext:
 
 @dataclass(frozen=True, slots=True)
 class LoggedEpisode:
-    """A logged episode: its last status and its bag; `is_complete` is False if it was cut short."""
+    """A logged episode: its last status and its bag; `is_complete` is False if it was cut short.
+
+    `late_commands` counts steps without a command for the latest observation; None in lockstep.
+    """
 
     status: EpisodeStatus
     path: Path
@@ -183,7 +186,7 @@ class EpisodeRecorder:
             self._end(DIVERGED if tick.has_diverged else None)
 
     def record_received(self, topic: TopicSpec, data: bytes, *, is_refused: bool = False) -> None:
-        """Log a message received since the last tick; drop it between two episodes."""
+        """Log a received message, if an episode is running; `is_refused`: the robot rejected it."""
         if self._last_tick is not None:
             self._put(partial(self._write_received, topic, data, is_refused))
 
@@ -192,8 +195,8 @@ class EpisodeRecorder:
 
         Args:
             reason: End reason of an episode that is still running.
-            gives_up: Called during the wait; True ends it. Then `fetch_hand_sim episodes recover`
-                can complete the unfinished files.
+            gives_up: Called repeatedly during the wait; ends it by returning True. Then
+                `fetch_hand_sim episodes recover` can complete the unfinished files.
         """
         self._end(reason)
         self._tasks.put(None)
@@ -236,7 +239,7 @@ class EpisodeRecorder:
             self._report_slow(now)
 
     def _oldest(self, now: float) -> float:
-        """Return when the oldest message not yet passed to the OS was queued; `now` without one."""
+        """Return when the oldest message not yet passed to the OS was queued; if none, `now`."""
         since = self._unflushed_since
         if since is not None:
             return since
@@ -345,7 +348,10 @@ class EpisodeRecorder:
 
 
 def episode_result(status: EpisodeStatus, late_commands: int | None = None) -> dict[str, str]:
-    """Return the metadata record `episode_result`; `status` is the last status of the episode."""
+    """Return the metadata record `episode_result`; `status` is the last status of the episode.
+
+    `late_commands` counts steps without a command for the latest observation; None in lockstep.
+    """
     return EpisodeOutcome(
         steps=status.tick,
         episode_return=status.episode_return,
@@ -403,6 +409,6 @@ def mjcf_attachment(path: Path) -> Attachment:
 
 
 def compiled_attachment(model: mujoco.MjModel) -> Attachment:
-    """Return the compiled model, compressed with zstd to 3 MB; call it once for all episodes."""
+    """Return the compiled model, compressed with zstd to 3 MB; slow, so reuse the result."""
     data = zstandard.ZstdCompressor(level=10).compress(compiled_bytes(model))
     return Attachment('model.mjb.zst', 'application/zstd', data)

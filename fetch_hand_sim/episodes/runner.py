@@ -220,7 +220,7 @@ class EpisodeRunner:
         return np.asarray(command)
 
     def set_next_seed(self, seed: int) -> None:
-        """Set the seed of the next episode; each later episode has the seed before it plus 1."""
+        """Set the seed of the next episode; the seed grows by 1 with each later episode."""
         following = self.episode if self.is_between_episodes else self.episode + 1
         self._new_first_seed = seed - following
         self._series_seed = seed - self._first_episode
@@ -321,7 +321,7 @@ def _check_stamp(runner: EpisodeRunner, stamp_ns: int) -> None:
 def bounded_wrench(wrench: Array, limit: float) -> Array:
     """Scale a wrench (6,), N and N m, down if its force or torque is beyond the limits.
 
-    `limit` is the largest force, N; it also determines the largest torque. Directions stay.
+    `limit` is the largest force, N; the largest torque is 0.1 m times `limit`. Directions stay.
     """
     force, torque = _sizes(wrench)
     share = max(force / limit, torque / (_LEVER * limit))
@@ -332,9 +332,10 @@ def bounded_wrench(wrench: Array, limit: float) -> Array:
 def accept_perturbation(
     runner: EpisodeRunner, topic: TopicSpec, message: Any, limit: float
 ) -> None:
-    """Push a body during the next tick of the running episode; ValueError if this is not allowed.
+    """Push the body that `message.header.frame_id` names, during the next tick.
 
-    `limit` is the largest force, N; 0 rejects all pushes.
+    `limit` is the largest force, N; the largest torque is 0.1 m times `limit`. ValueError beyond
+    these, without a running episode, or for a body that cannot move.
     """
     if not limit:
         raise ValueError('perturbations are off; perturb_limit:=10.0 at the start allows 10 N')

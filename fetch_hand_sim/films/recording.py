@@ -189,7 +189,7 @@ def tile(pictures: Sequence[Picture], columns: int) -> Picture:
 def grid(
     studio: Studio, recordings: Sequence[Recording], columns: int, hz: float
 ) -> Iterator[Picture]:
-    """Yield sheets, `hz` per second, that show all recordings side by side at the same time.
+    """Yield sheets, `hz` per simulated second, with all recordings side by side at equal times.
 
     A recording that has ended shows its last frame.
     """

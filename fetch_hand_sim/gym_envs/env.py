@@ -126,7 +126,10 @@ class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32
         return observation, float(reward), False, diverged, info
 
     def _evaluate(self, diverged: bool) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Return the result of a step, computed by the methods that a subclass may override."""
+        """Return the result of a step, from `_get_obs`, `_is_success` and the `compute_` methods.
+
+        If `diverged`, the result is truncated: the simulation has already begun a new episode.
+        """
         observation = self._get_obs()
         goals = observation['achieved_goal'], self.goal
         info = {'is_success': self._is_success(*goals), 'diverged': diverged}
@@ -189,7 +192,7 @@ class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32
         return self.__dict__.copy()
 
     def _draws_goals(self) -> bool:
-        """Disable goal sampling if `_sample_goal` is overridden; return whether it is enabled."""
+        """Let the simulation draw goals if `_sample_goal` is not overridden; return True if so."""
         draws_goals = not self.overrides('_sample_goal')
         self.simulation.task.draws_goals = draws_goals
         return draws_goals

@@ -1,8 +1,8 @@
 """Environments with the interface of Gymnasium-Robotics 1.4.2.
 
-Names, types and defaults are those of its `robot_env.py`, `fetch_env.py`, `reach.py` and
-`manipulate.py`. Subclasses may override its methods for goals, observations and the end of
-episodes. `docs/gymnasium_robotics.md` lists the differences.
+Names, types and defaults are those of Gymnasium-Robotics: `robot_env.py`, `fetch_env.py`,
+`reach.py` and `manipulate.py`. A subclass may override `_sample_goal`, `_get_obs`, `_is_success`
+and other methods. `docs/gymnasium_robotics.md` lists these methods and the differences.
 """
 
 from __future__ import annotations
@@ -89,16 +89,16 @@ CAMERAS: dict[str, dict[str, Any]] = {
 
 
 def _pictures(task: str, camera: Mapping[str, Any] | None) -> dict[str, Any]:
-    """Return `width`, `height` and `default_camera_config` of Gymnasium-Robotics.
+    """Return the arguments `width`, `height` (pixels) and `default_camera_config` for a task.
 
-    The attributes in `camera` replace those of the default camera.
+    The values are those of Gymnasium-Robotics; entries of `camera` replace camera attributes.
     """
     view = {**CAMERAS[task_spec(task).robot.name], **(camera or {})}
     return {'width': SIZE, 'height': SIZE, 'default_camera_config': view}
 
 
 def as_reference(reward: Any, reward_type: str) -> Any:
-    """Convert sparse rewards to float32, as Gymnasium-Robotics does; return others unchanged."""
+    """Convert sparse rewards to float32, as Gymnasium-Robotics does; keep dense ones unchanged."""
     return reward.astype(np.float32) if reward_type == 'sparse' else reward
 
 
@@ -148,7 +148,7 @@ class RobotEnv(FetchHandEnv, GoalEnv):
         )
 
     def __setattr__(self, name: str, value: Any) -> None:
-        """Set an attribute; reject new values of read-only attributes."""
+        """Set an attribute; raise AttributeError if it is read-only, such as `initial_qpos`."""
         if name in self.__dict__.get('_stated', ()):
             raise AttributeError(
                 f'{name} of {self.spec_of_task.name} is fixed; for other values write a task of '
@@ -201,10 +201,10 @@ class RobotEnv(FetchHandEnv, GoalEnv):
         return self.spec_of_task.has_object
 
     def render(self) -> Image | None:
-        """Call `_render_callback` and return a picture, as `FetchHandEnv.render` does.
+        """Call `_render_callback`, draw and return a picture; None in mode `human` or without mode.
 
-        Gymnasium's renderer draws the picture, with its cameras and markers, if `_render_callback`
-        is overridden or after the first read of `mujoco_renderer`.
+        By default `FetchHandEnv.render` draws the picture. Gymnasium's renderer draws it if
+        `_render_callback` is overridden, or after the first read of `mujoco_renderer`.
         """
         if self.render_mode is None:
             return None
@@ -218,7 +218,7 @@ class RobotEnv(FetchHandEnv, GoalEnv):
 
     @property
     def data(self) -> Any:
-        """The live `mujoco.MjData`, as in `FetchHandEnv`, with the target sites at the goal."""
+        """The `mujoco.MjData`, with markers at the goal; changes take effect in the next call."""
         data = super().data
         self._show_goal()
         return data
@@ -264,7 +264,7 @@ class RobotEnv(FetchHandEnv, GoalEnv):
         self._state(**{name: state[name] for name in state['_stated']})
 
     def _render_callback(self) -> None:
-        """Move the goal markers in `model` and `data`, once the user has read one of the two."""
+        """Move the goal markers in `model` and `data`; do nothing before a user reads either."""
         if self._physics.is_shared:
             self._show_goal()
             self._keep_goal()
@@ -429,7 +429,7 @@ class ManipulateEnv(RobotEnv):
 
 
 def make_env(task: str, **arguments: Any) -> RobotEnv:
-    """Make the environment of a task with the interface of Gymnasium-Robotics."""
+    """Make the environment of a task; `arguments` are those of its class, such as `FetchEnv`."""
     spec = task_spec(task)
     if task in FETCH_CONFIGS:
         return FetchEnv(task, **arguments)
@@ -521,7 +521,7 @@ class GymnasiumRoboticsVectorEnv(FetchHandVectorEnv):
         return as_reference(reward, self.reward_type)
 
     def attributes(self, name: str) -> tuple[Any, ...]:
-        """Return an attribute of every environment, including those of `RobotEnv`."""
+        """Return the N values of an attribute; read-only ones such as `initial_qpos`, too."""
         try:
             return super().attributes(name)
         except AttributeError:

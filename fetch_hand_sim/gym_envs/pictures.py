@@ -30,7 +30,7 @@ RENDER_MODES = ['human', 'rgb_array', 'depth_array']
 
 
 class Pictures:
-    """Renders copies of a simulation; opens OpenGL or a window at the first picture.
+    """Renders the robots of a batch; opens OpenGL or a window at the first picture.
 
     The constructor raises ValueError for an invalid size (pixels) or camera attribute. `render`
     raises RuntimeError if OpenGL is missing or, in mode `human`, if the display is missing.
@@ -53,7 +53,7 @@ class Pictures:
         self._window: Any = None
 
     def render(self, mode: str, index: int = 0) -> Image | None:
-        """Render copy `index` of the simulation.
+        """Render robot `index` of the batch.
 
         Returns:
             `rgb_array`: (height, width, 3). `depth_array`: (height, width), metres. `human`: None.

@@ -217,7 +217,7 @@ def register_gymnasium_robotics(override: bool = False) -> None:
 
 
 def reference_ids() -> dict[str, tuple[str, str]]:
-    """Return (task, reward type) for each id of Gymnasium-Robotics that has the same physics.
+    """Return (task, reward type) by Gymnasium-Robotics id, for ids that this package can replace.
 
     Older versions (Fetch -v1, HandReach -v0, HandManipulate* -v0) need mujoco-py and are left out.
     """

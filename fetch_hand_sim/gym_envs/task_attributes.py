@@ -104,7 +104,7 @@ class TaskAttributes:
             self.rotation_threshold = rotation_threshold
 
     def __setattr__(self, name: str, value: Any) -> None:
-        """Set an attribute; TypeError for a Gymnasium-Robotics method that this class ignores."""
+        """Set an attribute; TypeError for a Gymnasium-Robotics method that is never called here."""
         if name in self._uncalled:
             raise TypeError(f'{name} would have no effect here; {self._hint}')
         super().__setattr__(name, value)

@@ -152,7 +152,7 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
             at the last step and if MuJoCo diverged. The dictionary has `is_success` and `diverged`
             (N,); the masks `_is_success` and `_diverged` are False where this step started an
             episode. In mode `SAME_STEP` the dictionary also has `final_obs` (N,), a dictionary for
-            each ended episode, and `final_info`.
+            each ended episode, and `final_info`: `is_success` and `diverged` of ended episodes.
 
         Raises:
             ValueError: If the actions have a wrong shape, a value is NaN, or an overridden method
@@ -369,7 +369,7 @@ _SHARED = {'action_space': 'single_action_space', 'observation_space': 'single_o
 
 
 def _evaluated(result: StepResult) -> tuple[Array, Array, dict[str, Any]]:
-    """Return achieved and desired goals (N, goal size) and the info of a step."""
+    """Return achieved and desired goals (N, goal size), and `is_success` and `diverged` as info."""
     info = {'is_success': result.success.astype(np.float64), 'diverged': result.diverged}
     return result.observation['achieved_goal'], result.observation['desired_goal'], info
 

@@ -1,4 +1,4 @@
-"""The ROS node that publishes the messages of a `ReplaySchedule`."""
+"""The ROS node that publishes the messages of a logged episode again, at any speed."""
 
 from __future__ import annotations
 
@@ -80,7 +80,10 @@ class ReplayNode(Node):
         return open_publisher(self, replace(spec, name=self._name_here(name)))
 
     def _name_here(self, name: str) -> str:
-        """Return the name under which this node publishes a recorded topic."""
+        """Return a topic name with this node's namespace in place of the recorded one.
+
+        `/clock` and other names outside it stay; all names stay if this node has no namespace.
+        """
         namespace, recorded = self.get_namespace().rstrip('/'), f'{self._schedule.namespace}/'
         if not namespace or name == _CLOCK or not name.startswith(recorded):
             return name
@@ -139,8 +142,7 @@ class ReplayNode(Node):
     def _wait_for_commander(self, loop: EventLoop, stop: StopSignals) -> None:
         """Publish the latched topics; with `wait_for_commands`, wait until a policy is connected.
 
-        The policy reads its task from the latched topics. Without the wait, it would miss the first
-        observation.
+        A policy reads its task from them; without the wait, it would miss the first observation.
         """
         self._publish_latched()
         if not self._settings['wait_for_commands']:
@@ -158,7 +160,7 @@ class ReplayNode(Node):
             listeners.update()
 
     def _begin(self) -> None:
-        """Move the playhead to the start of the replay."""
+        """Move the replay to its start, `start_offset` seconds after the first message."""
         self._next = self._schedule.index_at(self._start_ns)
         self._playhead.jump(self._start_ns, time.monotonic())
 
@@ -173,7 +175,7 @@ class ReplayNode(Node):
         return False
 
     def _serve(self, loop: EventLoop) -> None:
-        """Serve callbacks until the next message is due, but at most for `BEAT` seconds."""
+        """Serve callbacks until a message is due, up to 0.1 s; if paused, resend `/clock`."""
         messages = self._schedule.messages
         due = messages[self._next].time_ns if self._next < len(messages) else self._end_ns
         remaining = self._playhead.remaining(due, time.monotonic())

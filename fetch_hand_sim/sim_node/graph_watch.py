@@ -130,7 +130,7 @@ class GraphWatch:
         self.has_newcomer |= self._subscribers.update()
 
     def are_subscribers_connected(self) -> bool:
-        """Return whether all subscribers are connected, so that a message reaches them."""
+        """Return whether all compatible subscribers of the robot's topics are connected."""
         self.has_newcomer |= self._subscribers.update()
         return self._subscribers.are_connected()
 

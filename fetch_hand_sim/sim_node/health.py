@@ -44,7 +44,6 @@ class Health:
 
     Args:
         node: The simulator node, with the parameters `episode_dir` and `publish_clock`.
-        robot: The robot.
         watch: State of the ROS graph, which the node updates.
         recorder: Logs the episodes; None if logging is off.
         now: Present time, at which the first report begins.
@@ -82,7 +81,7 @@ class Health:
         return self._recorder is not None and self._recorder.has_failed
 
     def messages(self, now: float) -> Messages:
-        """Return the messages to publish about the time since the last call; log new problems."""
+        """Return messages: report and real-time factor since the last call. Log new problems."""
         report = self.report(now)
         self._log_news()
         factor = self._factor_codec.encode(0, [self._real_time_factor])
@@ -179,7 +178,7 @@ class Health:
         return f'{tick} waits for a valid command; {self._command_source()}{last}'
 
     def _command_source(self) -> str:
-        """Return the part of a line that names the nodes from which commands are missing."""
+        """Return the end of a log line: which commanders send nothing, or that there are none."""
         if names := self._watch.inputs.commanders:
             return f'{", ".join(names)} {"sends" if len(names) == 1 else "send"} none'
         return '; '.join(['no node publishes any', *self._watch.waiting_elsewhere()])
@@ -228,7 +227,7 @@ class Health:
         }
 
     def _log_news(self) -> None:
-        """Log changes of commanding nodes, new lasting problems and the first far-out command."""
+        """Log new commanders, new lasting problems and the first command far outside its limits."""
         logger, buffer = self._node.get_logger(), self._robot.buffer
         commanders = self._watch.inputs.commanders
         if commanders != self._commanders:

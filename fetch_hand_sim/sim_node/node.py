@@ -225,7 +225,10 @@ class SimNode(Node):
             loop.wait(BEAT)
 
     def _serve_until_due(self, loop: EventLoop, stop: StopSignals) -> None:
-        """Run a due tick, in real time after waiting callbacks; otherwise serve one callback."""
+        """Run the tick if it is due; otherwise wait at most `BEAT` seconds for a callback.
+
+        One received callback runs. In real time, callbacks that already wait run before the tick.
+        """
         remaining = self._robot.wait()
         if remaining > 0.0:
             loop.wait(min(remaining, BEAT))
@@ -239,9 +242,9 @@ class SimNode(Node):
             self._ticked_at = time.monotonic()
 
     def _beat_when_due(self) -> None:
-        """Do periodic work every `BEAT` seconds: `latest_tick`, ROS graph, diagnostics.
+        """Every `BEAT` seconds, publish `latest_tick`; when due, check the ROS graph and report.
 
-        If a tick is due soon, the tick runs first.
+        If a tick is due within 10 ms, the tick runs first. The report is published as diagnostics.
         """
         now = time.monotonic()
         if now < self._beat_due or (
@@ -259,7 +262,7 @@ class SimNode(Node):
             self._publish(self._health.messages(now))
 
     def _stand_still(self, now: float) -> None:
-        """Without ticks, repeat the last tick for new subscribers and log a missing command.
+        """While no tick runs, repeat the last tick for new subscribers; warn of a missing command.
 
         While paused or before the first tick, publish `/clock`, too.
         """
@@ -334,7 +337,7 @@ class SimNode(Node):
             self._recording_context.checkpoint_sha256 = checkpoint_sha256
 
     def _clear_departed_policy(self) -> None:
-        """Clear the checkpoint hash when the policy disappears."""
+        """Remove the policy's checkpoint hash from the metadata to log once it has disconnected."""
         context = self._recording_context
         if (
             context is not None

@@ -61,9 +61,8 @@ class Robot:
     """Simulates a robot tick by tick, and executes services and received goals.
 
     Attributes:
-        counters: Counts since the start.
         perturb_limit: Largest force of a push, N; 0 rejects all pushes.
-        has_commander: Whether the node waited for a policy; then the first step expects a command.
+        has_commander: True once the node has waited for a policy; ticks then expect commands.
         last_messages: Messages of the last tick, which are repeated for new subscribers.
     """
 
@@ -104,15 +103,15 @@ class Robot:
 
     @property
     def is_reset_due(self) -> bool:
-        """True if a robot that stands still must now run the reset that a service requested."""
+        """True if a paused or waiting robot must now run the reset that a service requested."""
         return self._reset_due is not None and self._reset_due <= self._clock()
 
     @property
     def misses_commands(self) -> bool:
-        """True if an expected command is more than a second late; pauses do not count.
+        """True if an expected command is later than a limit; pauses do not count.
 
-        In lockstep every tick expects a command. In real time commands are expected after the first
-        one, and the limit is at least `command_timeout` and two tick periods.
+        In lockstep every tick expects a command, within 1 s. In real time commands are expected
+        after the first one, within the largest of 1 s, `command_timeout` and two tick periods.
         """
         schedule = self.schedule
         if schedule.is_paused or not self.runner.has_started:
@@ -202,9 +201,9 @@ class Robot:
     # Services and parameters
 
     def reset(self, *, to_first_episode: bool = False) -> Answer:
-        """End the running episode; the next tick starts the next one, or the first one again.
+        """End the running episode; the next tick starts the next or (`to_first_episode`) the first.
 
-        A paused robot, or one that waits for commands, runs that next tick without a command.
+        A paused or waiting robot runs this tick without a command. `success` is always True.
         """
         runner = self.runner
         episode, was_running = runner.episode, not runner.is_between_episodes
@@ -242,7 +241,7 @@ class Robot:
         return Answer(True, f'{"paused" if paused else "running"} at {self._now()}')
 
     def step(self, ticks: int = 1) -> Answer:
-        """Run ticks immediately; in real time this fails unless the robot is paused."""
+        """Run ticks now; `success` is False in unpaused real time or if the episodes run out."""
         if self.schedule.mode == 'realtime' and not self.schedule.is_paused:
             return Answer(False, 'a running simulation cannot be stepped; pause it first')
         if not 1 <= ticks <= MAX_STEPS:

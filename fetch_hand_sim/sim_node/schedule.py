@@ -31,7 +31,7 @@ class TickSchedule:
     Attributes:
         changes: Number of pauses, resumptions and changes of the pace.
         missed_ticks: Deadlines that passed without a tick.
-        answer_wait: Longest delay of a tick, s, while the answer to the last tick is missing.
+        answer_wait: Longest delay of a tick, s, while no command answers the last tick.
     """
 
     def __init__(
@@ -82,9 +82,9 @@ class TickSchedule:
         return max(0.0, due + (self.answer_wait if lacks_answer else 0.0) - now)
 
     def postpone(self, until: float) -> None:
-        """Move the deadline to the time `until` if that is later, but by at most `answer_wait`.
+        """Move the deadline of the next tick to the time `until`, but by at most `answer_wait`.
 
-        Call it before `begin` if the tick waited for a command; all later deadlines move, too.
+        An earlier `until` changes nothing. All later deadlines move, too. Call it before `begin`.
         """
         self._due = min(max(self._due, until), self._due + self.answer_wait)
 

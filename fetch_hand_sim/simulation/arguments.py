@@ -101,9 +101,10 @@ def selected_simulations(ids: ArrayLike, num_envs: int) -> NDArray[np.intp]:
 
 
 def generators(seed: Seeds, selected: NDArray[np.intp]) -> list[np.random.Generator | None]:
-    """Return the new random generator of each selected simulation; None if it keeps its generator.
+    """Return a new random generator for each selected simulation, or None where no seed is given.
 
-    `seed` is as in `Simulation.reset`; invalid seeds raise ValueError.
+    `seed` is one integer (simulation i takes `seed` + i), a list with an integer, a generator or
+    None for each selected simulation, or None for all. Invalid seeds raise ValueError.
     """
     if seed is None:
         return [None] * selected.size
@@ -217,7 +218,7 @@ def _require_within(name: str, values: ArrayLike, lowest: float, highest: float)
 
 
 def _require_apart(start: StartState, task: Task) -> None:
-    """Raise ValueError if bodies overlap by more than `_DEEPEST` in the start state."""
+    """Raise ValueError if bodies overlap by over 5 mm; ignore an object without a given pose."""
     data, model = task.new_data(task.start_state), task.model
     start.write(data.qpos, data.qvel)
     mujoco.mj_forward(model, data)

@@ -255,7 +255,7 @@ class Disturber:
         return np.asarray(noise * white + self._biases[:, columns])
 
     def push(self, forces: Array) -> bool:
-        """Add the pushes of this tick to wrenches (N, bodies, 6); return whether there are any."""
+        """Add this tick's pushes to forces and torques (N, bodies, 6); return True if any acts."""
         pushes = self.disturbances.pushes
         if not pushes.force:
             return False
@@ -395,7 +395,7 @@ class VariedPhysics:
     """Gives each simulation its own copy of some model fields, with varied values.
 
     Attributes:
-        names: The variations that are switched on.
+        names: The variations of physics that `apply` uses.
     """
 
     def __init__(self, task: Task, physics: PhysicsDisturbance) -> None:
@@ -440,7 +440,7 @@ class VariedPhysics:
         return any(len(rows) for rows in self._rows[name].values())
 
     def allow(self, name: str) -> None:
-        """Switch on a variation, or raise ValueError if the task or the model does not allow it."""
+        """Add a variation to `names`; raise ValueError if task or model does not allow it."""
         if name in self.names:
             return
         if not self._has(name):
@@ -464,7 +464,7 @@ class VariedPhysics:
     def apply(self, ids: Ids, variations: Mapping[str, Array]) -> bool:
         """Vary the physics of simulations `ids` by `variations`, (N,) each; call `restore` first.
 
-        Returns True if at least one variation is switched on.
+        Returns False if `names` is empty, so that nothing varies.
         """
         for name in self.names:
             factors, live = variations[name][ids], self._live
@@ -495,6 +495,6 @@ class VariedPhysics:
 
 
 def first_body(model: mujoco.MjModel, names: tuple[str | None, ...]) -> int:
-    """Return the index of the first of these bodies that exists in the model, else 0."""
+    """Return the index of the first body of `names` that the model has, or 0 if it has none."""
     numbers = (find(model, mujoco.mjtObj.mjOBJ_BODY, str(name)) for name in names)
     return next((number for number in numbers if number > 0), 0)

@@ -98,7 +98,7 @@ def free_joint(model: mujoco.MjModel, body: str | None) -> tuple[slice, slice] |
 
 
 def geom_color(model: mujoco.MjModel, geom: int) -> Array:
-    """Return the RGBA colour (4,) in which MuJoCo draws a geom: its own, or its material's."""
+    """Return the RGBA colour (4,) of a geom, or of its material if the geom's is the default."""
     own = np.array(model.geom_rgba[geom], dtype=np.float64)
     material = int(model.geom_matid[geom])
     if material < 0 or not np.array_equal(own, _NO_COLOR):

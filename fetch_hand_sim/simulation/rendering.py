@@ -66,7 +66,7 @@ class SceneRenderer:
         """Return the picture of a frame, (height, width, 3) bytes.
 
         Args:
-            trail: Earlier positions of the object or gripper, (3,) each.
+            trail: Earlier positions of the object, gripper or first fingertip, (3,) each.
         """
         self._update(frame)
         scene = self._renderer.scene
@@ -176,7 +176,7 @@ def _refuse(name: str, value: object, allowed: str) -> NoReturn:
 
 
 def simulation_frame(simulation: Simulation, index: int = 0) -> Frame:
-    """Return the present frame of copy `index` of a simulation."""
+    """Return the current state of simulation `index` of a batch as a `Frame`, for pictures."""
     readings, observation = simulation.readings(), simulation.observe()
     achieved, desired = observation['achieved_goal'][index], observation['desired_goal'][index]
     spec = simulation.spec

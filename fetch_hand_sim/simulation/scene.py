@@ -170,7 +170,7 @@ class Scene:
         """Return the markers of goal, achieved goal and trail.
 
         Args:
-            trail: Earlier positions (3,) of the object or gripper, the oldest first.
+            trail: Earlier positions (3,) of object, gripper or first fingertip, the oldest first.
         """
         color = REACHED if frame.is_success else MISSED
         if self.has_ghost:
@@ -220,7 +220,7 @@ class Scene:
         return Marker(shape, size, position, (red, green, blue, opacity), quaternion)
 
     def _shell(self, frame: Frame, color: Color) -> list[Marker]:
-        """Return a marker around the ghost whose colour shows whether the goal is reached."""
+        """Return a list with one marker, a shell around the ghost; `color` shows success."""
         geom = self.model.geom(GHOST)
         pose = ghost_pose(self.spec, frame.desired_goal)
         tint = (*color[:3], 2.0 * _HALO_OPACITY)
@@ -237,7 +237,7 @@ def ghost_pose(spec: TaskSpec, goal: Array) -> Array:
 
 
 def tracked_position(frame: Frame) -> Array:
-    """Return the position (3,) of the object, or of the gripper in tasks without an object."""
+    """Return the position (3,) of the object, else of the gripper or the first fingertip."""
     if frame.object_pose is not None:
         return frame.object_pose[:3].copy()
     return frame.achieved_goal[:3].copy()

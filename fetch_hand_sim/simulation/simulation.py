@@ -342,7 +342,7 @@ class Simulation:
         self.goals[selected] = wanted
 
     def perturb(self, body: str, wrench: ArrayLike, index: int = 0) -> None:
-        """Push a body of one simulation during the next step, or raise ValueError.
+        """Push a body of one simulation during the next step; ValueError for an invalid argument.
 
         Args:
             body: Name of a movable body of the model.

@@ -79,7 +79,7 @@ def _specification(spec: TaskSpec) -> Rules:
 
 
 def _model(task: Task) -> Rules:
-    """Yield (condition, error): an object has a free joint; pictures show the simulated model."""
+    """Yield (is met, error): an object has a free joint; simulated geoms equal the MJCF file."""
     name = task.spec.object_name
     yield (
         name is None or task.object_qpos is not None,
@@ -109,7 +109,7 @@ def _sensors(task: Task) -> Rules:
 
 
 def _formulas(task: Task) -> Rules:
-    """Yield (condition, error) pairs about the formulas of observation and achieved goal.
+    """Yield pairs (is met, error) about the formulas of observation and achieved goal.
 
     The formulas must accept readings with any leading axes, and compute each row independently.
     """
@@ -150,7 +150,7 @@ def _rewards(simulation: Simulation) -> Rules:
 
 
 def _resets(simulation: Simulation) -> Rules:
-    """Yield (condition, error): equal seeds repeat episodes; resets change no other simulation."""
+    """Yield (is met, error): equal seeds repeat episodes; resets change no other simulation."""
     size = simulation.spec.robot.action_size
     simulation.reset(seed=[0, 1])
     first = _all_sensors(simulation)

@@ -246,7 +246,7 @@ def _sphere(radius: float) -> ElementTree.Element:
 def _mesh(
     mjcf: mujoco.MjSpec, model: mujoco.MjModel, mesh: int, position: Array, quaternion: Array
 ) -> tuple[ElementTree.Element, Array, Array]:
-    """Return a mesh element with its pose, without MuJoCo's shift to the inertia frame."""
+    """Return a mesh element and the pose of its file frame, from the pose of its inertia frame."""
     source: Any = mjcf.mesh(model.mesh(mesh).name)
     path = (Path(mjcf.modelfiledir) / mjcf.meshdir / source.file).resolve()
     back = np.array([1.0, -1.0, -1.0, -1.0]) * model.mesh_quat[mesh]

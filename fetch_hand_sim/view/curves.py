@@ -21,7 +21,6 @@ class Curves:
     """Stores goal distances, rewards, commands and joint positions of the last ticks.
 
     Args:
-        spec: The task.
         metric: Computes the distance to the goal.
         length: Number of ticks to store.
     """
@@ -84,7 +83,7 @@ class Curves:
 
 
 class History:
-    """Stores the newest tick of a running robot as `picture`, its trail and its `curves`."""
+    """Stores `picture` (newest tick of a running robot, with trail) and `curves` of past ticks."""
 
     def __init__(self, spec: TaskSpec, metric: GoalMetric) -> None:
         self.spec = spec

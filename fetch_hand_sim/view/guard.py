@@ -79,7 +79,7 @@ class Attendance:
         self._visits += 1
 
     def has_left(self) -> bool:
-        """True if the page in control sent no input for 3 s or disconnected since the last call."""
+        """Return True if the page sent no input for 3 s, or disconnected after the last call."""
         visits, before = self._visits, self._known_visits
         self._known_visits = visits
         return visits != before or not self.is_there

@@ -89,13 +89,13 @@ class LiveRobot:
 
     @property
     def picture_period(self) -> float:
-        """Seconds between two frames without input: 1/12 above 1.5 times real time, else 1/30."""
+        """Seconds between frames without input: 1/12 if faster than 1.5 x real time, else 1/30."""
         status = self._watch.status
         is_fast = status is not None and self._facts.rate > _HURRY * status.control_hz
         return OVERLOOKING if is_fast else FOLLOWING
 
     def picture(self) -> Picture | None:
-        """Return the new picture, or None if nothing has changed since the last call."""
+        """Return all that the page shows now; None if nothing has changed since the last call."""
         if not self._is_new or self._history is None:
             return None
         self._is_new = False
@@ -168,9 +168,9 @@ class LiveRobot:
         self._update_facts(phase=status.phase, episode=status.episode, seed=status.seed)
 
     def _history_for(self, spec: TaskSpec, status: EpisodeStatus) -> History:
-        """Return the history for a status: a new one for another task or the phase `waiting`.
+        """Return the `History` (trail and curves) to which the next ticks are added.
 
-        If only the success rule has changed, keep the history, but begin new curves.
+        It is new for another task or in the phase `waiting`. A new success rule clears its curves.
         """
         known, rule = self._history, status.success_rule
         # A waiting robot has no episode yet.
@@ -210,7 +210,7 @@ class LiveRobot:
             self._update_facts(is_silent=False)
 
     def _look(self) -> None:
-        """Check for another robot, a replay or silence; read speed and actor if they may be new."""
+        """Detect a restarted, replayed or silent robot; request speed and actor if outdated."""
         self._notice_other_robot()
         is_other = self._replays.look()
         replay = self._replays.replay
@@ -233,14 +233,14 @@ class LiveRobot:
             self._requests.read_actor()
 
     def _end_notice(self) -> None:
-        """Remove the notice when it is older than 3 s and another episode has begun since then."""
+        """Clear the notice on the page once it is over 3 s old and another episode has begun."""
         episode, since = self._noticed
         is_over = episode != (self._facts.episode, self._facts.seed)
         if self._facts.notice and is_over and time.monotonic() - since > _NOTICE_TIME:
             self._update_facts(notice='')
 
     def _follow_replay(self, name: str) -> None:
-        """Update the `Facts` for the replay node `name`, which publishes no diagnostics."""
+        """Update what the page shows of the replay node `name`, which publishes no diagnostics."""
         self._hear()
         self._asked_rate = None
         self._unread.add('speed')

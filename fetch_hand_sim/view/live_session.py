@@ -79,9 +79,9 @@ def _run(options: argparse.Namespace, stop: StopSignals) -> None:
 
 
 def attended(robot: LiveRobot, attendance: Attendance) -> Perform:
-    """Return a function that passes requests to a robot only while the page is in use.
+    """Return a function that passes requests to a robot only while the page in control is in use.
 
-    An unused page is still drawn, so a button that was held would repeat its request.
+    Otherwise a button held on a hidden or disconnected page would repeat its request.
     """
 
     def perform(request: Request) -> None:
@@ -105,7 +105,7 @@ def _nodes(
 
     Raises:
         NodeFailure: If no fitting robot is found, or a started process has ended.
-        UsageError: If options are given that only a new robot could use.
+        UsageError: If a robot already runs, but `--policy` or `--episode-dir` is given.
     """
     end = time.monotonic() + (DISCOVERY_TIME if options.task else options.wait)
     while robot.spec is None and not stop and time.monotonic() < end:
@@ -133,7 +133,7 @@ def _check_is_wanted(options: argparse.Namespace, spec: TaskSpec, where: str) ->
 
     Raises:
         NodeFailure: If the robot has another task than `options.task`.
-        UsageError: If options are given that only a new robot could use.
+        UsageError: If `--policy` or `--episode-dir` is given: the running robot cannot use them.
     """
     if options.task not in (None, spec.name):
         raise NodeFailure(f'a robot in {where} runs already and does {spec.name}')

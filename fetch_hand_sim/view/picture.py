@@ -77,15 +77,15 @@ class Series:
 
 @dataclass(frozen=True, slots=True)
 class Graphs:
-    """The curves of the page; None where the task has no such curve.
+    """The curves of the page; a curve that the task does not have is None.
 
     Attributes:
         distance: Distance to the goal, m.
         rotation: Rotation to the goal, rad, 0 ... pi.
-        commands: Values (ticks, action size), command units.
-        positions: Values (ticks, action size) of the joints that the commands drive, rad. The
-            fingers of the Fetch are -1 (closed) to 1 (open). Commands that move the gripper along
-            an axis have NaN.
+        reward: Reward of each tick; NaN at a reset.
+        commands: Values (ticks, action size), command units; NaN at a reset.
+        positions: Values (ticks, action size) of the joint that each command drives, rad. Fetch:
+            NaN for moves of the gripper along an axis; -1 (closed) to 1 (open) for the fingers.
     """
 
     distance: Series | None = None
@@ -117,10 +117,9 @@ class Picture(messages.Snapshot):
     """Message with everything that the page shows of one tick.
 
     Attributes:
-        task: Name of the task.
         frame: State of robot, object and goals; None before the first tick.
         stamp_ns: Simulated time of the frame, nanoseconds.
-        trail: Last positions (3,) of the object or gripper, the newest at the end.
+        trail: Last positions (3,) of the object, gripper or first fingertip, the newest at the end.
         command: The last applied command (action size,); None at a reset.
         timeline: Position in the file; None for a running robot.
     """

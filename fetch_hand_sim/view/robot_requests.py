@@ -47,7 +47,6 @@ class RemoteNode:
     """Calls services of another node without waiting for the responses.
 
     Args:
-        node: The node of this process.
         name: Name of the other node, fully qualified or relative to the namespace of `node`.
         notice: Called with a line for the user, for example if a call is rejected.
     """
@@ -149,11 +148,10 @@ class RemoteNode:
 
 
 class RobotRequests:
-    """Sends requests of the page to the nodes in the namespace of `node`.
+    """Sends requests of the page to simulator, policy and replay node in the namespace of `node`.
 
     Args:
-        node: The node of this process.
-        tell: Called with changed fields of `Facts` as keyword arguments.
+        tell: Called with keyword arguments: changed fields of `Facts`, the state shown by the page.
     """
 
     def __init__(self, node: Node, tell: Callable[..., None]) -> None:
@@ -211,7 +209,10 @@ class RobotRequests:
             self._policy.get_parameter('policy', lambda name: self._tell(actor=name or shipped))
 
     def perform(self, request: Request, facts: Facts) -> None:
-        """Send a request to the robot, whose state is `facts`; ignore requests about files."""
+        """Send a request to the simulator, policy or replay node; ignore requests about files.
+
+        `facts` limit requests: `is_commanding` those with commands, `push_limit` those with pushes.
+        """
         if self._spec is None or not self.fits(request):
             return
         if self._replay is not None and not isinstance(request, _OF_A_REPLAY):
@@ -278,7 +279,7 @@ class RobotRequests:
 
     @property
     def _time(self) -> RemoteNode:
-        """The node that controls pause and speed: the replay node, or without one the robot."""
+        """The node that controls pause and speed: the replay node, or without one `sim_node`."""
         return self._sim if self._replay is None else self._replay[1]
 
     @property

@@ -286,12 +286,9 @@ class ReplayWatch:
         return found != before
 
     def stands_still(self, is_paused: bool) -> bool:
-        """Return whether a replay is paused; ticks during a pause mean that it was resumed.
+        """Return `is_paused`, but False if a tick since the last call shows a resumed replay.
 
-        Call it periodically. The first two calls of a pause ignore ticks, which may be older.
-
-        Args:
-            is_paused: Whether the replay is believed to be paused.
+        Call periodically; the first two calls of a pause ignore ticks, which may precede it.
         """
         moved, self._moved = self._moved, False
         self._paused_looks = self._paused_looks + 1 if is_paused else 0

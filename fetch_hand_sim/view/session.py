@@ -26,7 +26,7 @@ _DROPPED = (
 
 
 class Requests(plugin.SimPlugin):
-    """A viewer plugin that calls `perform` with each request of the page.
+    """A viewer plugin that passes each `Request` of the page to the function `perform`.
 
     A body that the mouse pulls (a perturbation of MuJoCo) becomes a `Push` request.
     """
@@ -49,11 +49,11 @@ class Requests(plugin.SimPlugin):
 
 
 class Session:
-    """Sends pictures from the source to the page, and requests back.
+    """Sends the state of a robot or file player to the page, and handles messages of the page.
 
     Args:
         handle: The viewer that shows the page.
-        picture: Returns the new picture, or None if nothing has changed.
+        picture: Returns a message with the new state, or None if nothing has changed.
     """
 
     def __init__(
@@ -64,7 +64,7 @@ class Session:
         self._scene: Scene | None = None
 
     def update(self) -> bool:
-        """Show the new picture, if any, and pass on requests; return whether a picture was shown.
+        """Return True if a new state was sent to the page; also handle messages of the page.
 
         Raises:
             Exception: The error that ended the thread of the viewer.

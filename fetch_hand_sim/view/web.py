@@ -106,7 +106,10 @@ class FrameRate:
         self._began = 0.0
 
     def wait_time(self, now: float, touch: Touch) -> float:
-        """Return the seconds to wait before the next frame; call it once per frame."""
+        """Return the seconds to wait before the next frame; call it once per frame.
+
+        `touch` is the mouse, wheel and keyboard input at the time `now`.
+        """
         is_held = touch.is_down or touch.is_typing or touch.wheel != 0.0
         if is_held or touch.mouse != self._touch.mouse:
             self._touched = now
@@ -124,7 +127,7 @@ class _Viewer(web_viewer.WebViewer):
     frame_rate: FrameRate
 
     def prepare_next_frame(self) -> bool:
-        """Wait until the next frame is due and begin it."""
+        """Wait until the next frame is due and begin it; return False if the page disconnected."""
         time.sleep(self.frame_rate.wait_time(time.monotonic(), _read_touch()))
         begun: bool = super().prepare_next_frame()
         return begun
@@ -170,19 +173,18 @@ def open_page(
     attendance: Attendance | None = None,
     is_read_only: bool = False,
 ) -> tuple[viewer_handle.ViewerHandle, Address]:
-    """Serve the page from a thread and check that the guard works; call it once per process.
+    """Serve the page from a thread, behind a `Guard`; return its viewer and its address.
+
+    Call it once per process.
 
     Args:
         host: Interface to listen on.
         port: A port, or 0 for the first free one from 8080.
-        plugins: Viewer plugins and simulation plugins of the page.
-        frame_rate: Decides when frames are drawn.
         attendance: Records whether the page in control is in use.
-        is_read_only: Whether the page can only watch.
 
     Raises:
         CommandError: If the port is taken, the host is no address of this machine, or the server
-            does not answer or does not use the guard.
+            does not answer or accepts a foreign Host header.
     """
     listening = _listen(host, port)
     port = listening.getsockname()[1]

@@ -112,8 +112,6 @@ def camera_info(width: int, height: int, fovy: float, frame_id: str, stamp_ns: i
     """Return the calibration message of a camera without distortion.
 
     Args:
-        width: Width of the picture, pixels.
-        height: Height of the picture, pixels.
         fovy: Vertical field of view, degrees.
         frame_id: Optical frame of the camera.
     """
@@ -153,7 +151,7 @@ class Scalars:
         self._codecs = {source.name: TopicCodec(source) for source in scalar_topics(spec)}
 
     def messages(self, tick: SeenTick) -> dict[str, bytes]:
-        """Return CDR bytes by topic; there is no reward at a reset."""
+        """Return CDR bytes by topic; at a reset, the topic of the reward is missing."""
         frame = tick.frame
         distance, rotation = self._metric.distances(frame.achieved_goal, frame.desired_goal)
         numbers = {

@@ -103,7 +103,7 @@ class VisualizationNode(Node):
             loop.close()
 
     def _open(self, source: TopicSpec) -> None:
-        """Open a publisher; warn if the message package is missing: only ROS has tf2_msgs."""
+        """Open a topic's publisher; only warn if its message package is not installed."""
         try:
             self._outputs[source.name] = open_publisher(self, source)
         except ImportError:
@@ -165,7 +165,7 @@ class VisualizationNode(Node):
             output.publish(output.msg_type(transforms=transform_messages(transforms, stamp_ns)))
 
     def _show_latest(self) -> None:
-        """Publish markers and pictures of the newest tick; other ticks may be left out."""
+        """Publish markers and pictures of the newest tick if subscribed; skip older ticks."""
         scene = self._scene
         if scene is None:
             return

@@ -81,7 +81,7 @@ def frame_prefix(namespace: str) -> str:
 
 
 def view_transform(view: View, name: str) -> Transform:
-    """Return the pose of a camera's optical frame (z ahead, x right, y down) in the world frame."""
+    """Return the world pose of a camera's optical frame `name` (x right, y down, z ahead)."""
     azimuth, elevation = np.radians(view.azimuth), np.radians(view.elevation)
     level = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
     ahead = np.cos(elevation) * level + np.array([0.0, 0.0, np.sin(elevation)])

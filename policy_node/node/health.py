@@ -37,7 +37,7 @@ class Pace:
 
 
 def read_pace(message: Any, namespace: str) -> Pace | None:
-    """Return the pace of the robot in `namespace` from `/diagnostics`; None if it is missing."""
+    """Return a robot's pace from a `/diagnostics` message; None without a robot in `namespace`."""
     for status in message.status:
         if status.name.rpartition('/')[0] == namespace.rstrip('/'):
             values = {pair.key: pair.value for pair in status.values}
@@ -56,7 +56,7 @@ def _period(values: Mapping[str, str]) -> float:
 
 
 class Health:
-    """Makes the diagnostic reports of the node `name` from the counters of its `Responder`."""
+    """Makes diagnostic reports of the policy node `name`: commands, failures, robots and topics."""
 
     def __init__(self, name: str) -> None:
         self._name = name
@@ -69,7 +69,7 @@ class Health:
         self._said: set[str] = set()
 
     def start(self, responder: Responder, status: EpisodeStatus, now: float) -> None:
-        """Begin to report on a robot; `now` is the time of the responder's clock, in seconds."""
+        """Begin to report on `responder`, which commands a robot; `now` is seconds of its clock."""
         self._responder, self._then = responder, now
         self._tick_duration = 1.0 / status.control_hz
         self._increases.clear()
@@ -131,7 +131,7 @@ class Health:
         return {name: round(self._increases[name].since(n)) for name, n in counters.items()}
 
     def news(self, report: Report) -> list[str]:
-        """Return the problems of `report` that the previous report did not have.
+        """Return the problem texts of `report` that the report of the last call did not have.
 
         Problems with equal text before the first colon count as the same.
         """

@@ -110,7 +110,7 @@ class PolicyNode(Node):
         responder.send_unsent()
 
     def _load_ahead(self) -> LoadedPolicy | None:
-        """Load the policy at the start, to show errors early; None if it needs a robot's task."""
+        """Load the policy early, to show errors; None if the policy depends on the robot's task."""
         settings = self._settings
         try:
             return load_policy(
@@ -124,7 +124,7 @@ class PolicyNode(Node):
     def _start(self, status: EpisodeStatus, loop: EventLoop, stop: StopSignals) -> None:
         """Subscribe to the state of the robot, wait for its publishers and open `commands`.
 
-        Return without `commands` if `stop` is set, or the robot or policy changes meanwhile.
+        If `stop` is set, or the robot or policy changes, return early and do not open `commands`.
 
         Raises:
             NodeFailure: If no policy is found, or the policy does not fit the robot.
@@ -158,7 +158,7 @@ class PolicyNode(Node):
         """Return the loaded policy if it has the task of the robot, else load one for this task.
 
         Raises:
-            ValueError: If no policy for this task is found, or parameter `task` is another one.
+            ValueError: If no policy for this task is found, or parameter `task` names another task.
         """
         wanted, name = self._settings['task'], self._settings['policy']
         if wanted and wanted != status.task:
@@ -299,8 +299,8 @@ class PolicyNode(Node):
     def _may_follow(self, status: EpisodeStatus) -> bool:
         """Return whether to follow the robot that published `status`.
 
-        True for the present robot, for a robot that replaced it, and for a second robot that the
-        policy fits.
+        True for the first robot, the present one, the only one on the topic (it replaced the
+        present one), and for a second robot whose task and frequency a policy fits.
         """
         known = self._status
         if known is None or status.is_of_same_robot(known):
@@ -342,7 +342,7 @@ class PolicyNode(Node):
             self.get_logger().warning(line)
 
     def _robots_elsewhere(self) -> list[str]:
-        """Return the namespaces with a publisher of `episode_status`."""
+        """Return all namespaces that have a robot; called if this node's namespace has none."""
         wanted = topic(_ANY_TASK, 'episode_status')
         found = []
         for name, types in self.get_topic_names_and_types():

@@ -32,9 +32,9 @@ _LATEST = 1.0
 class StampJoin:
     """Collect the vectors of several topics until all of them have arrived with the same stamp.
 
-    Such a stamp is complete. It drops all earlier stamps, because a policy needs the newest state
-    only. A much earlier stamp that becomes complete means that the simulation was started again. A
-    single message with a wrong stamp from another publisher has no effect.
+    A stamp with all topics is complete. Earlier incomplete stamps are then dropped, because a
+    policy needs the newest state only. A complete stamp more than 1 s before the last one means
+    that the simulation was started again. A wrong stamp on one topic never becomes complete.
 
     Args:
         topics: Names of the topics to join.
@@ -60,10 +60,7 @@ class StampJoin:
         self.dropped = 0
 
     def add(self, topic: str, stamp: int, vector: NDArray[np.float64]) -> Vectors | None:
-        """Add the vector of a topic; return the vectors of all topics once the stamp is complete.
-
-        The stamp is in nanoseconds.
-        """
+        """Add a vector with its stamp, ns; return all vectors if the stamp is complete, or None."""
         if self._last is not None and self._is_late(self._last - stamp):
             return None
         vectors = self._pending.setdefault(stamp, {})
@@ -84,8 +81,8 @@ class StampJoin:
     def _is_late(self, delay: int) -> bool:
         """Return whether to drop a message that is `delay` ns older than the last complete stamp.
 
-        Drop it at delay 0, and up to 1 s if that stamp was completed less than 1 s ago. Keep it if
-        it is newer, or older than 1 s: the simulation was started again.
+        At delay 0: True. Above 0 and up to 1 s: True if that stamp became complete less than 1 s of
+        wall-clock time ago. Otherwise False: the message is newer, or the simulation restarted.
         """
         if not 0 < delay <= _LONGEST_DELAY:
             return delay == 0
@@ -112,13 +109,11 @@ class Responder:
     robot is faster than the policy, ticks are skipped; the delay does not grow.
 
     Args:
-        policy: The policy.
         status: An `episode_status` of the robot, for its task, joint names and frequency.
         send: Publishes the CDR bytes of a command; returns False without a subscriber.
         clock: A steady clock, seconds.
 
     Attributes:
-        policy: The policy of the robot.
         topics: The topics that the policy needs.
         join: The `StampJoin` of these topics.
         answered: Number of commands sent.

@@ -57,9 +57,9 @@ class ActorInfo:
         env_steps: Environment steps of the training.
         config: Training configuration by field.
         success: Measured success and how it was measured; empty if unmeasured.
-        goal_features: Kind of the network inputs: `plain`, `relative` or `symmetric`.
-        init_from: Name, task, environment steps and `init_from` of the networks that its training
-            started from; empty for random networks.
+        goal_features: Goal inputs: `plain`, `relative` (and difference to the goal), `symmetric`.
+        init_from: Origin of the initial networks: `name`, `task`, `env_steps`, `init_from` (their
+            own origin) and others. Empty for random networks.
         past_actions: Number of past actions among the inputs.
     """
 
@@ -188,7 +188,7 @@ def parse_metadata(metadata: dict[str, str], path: str | Path) -> ActorInfo:
     """Return the checked metadata of a checkpoint or ONNX file.
 
     Raises:
-        ValueError: If they have another version or do not fit a task. The message names `path`.
+        ValueError: If a field is missing or invalid, or does not fit the task or the version.
     """
     _check_format(path, metadata)
     if sum(map(len, metadata.values())) > LARGEST_HEADER:

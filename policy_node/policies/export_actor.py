@@ -60,14 +60,14 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def export(source: Path, target: Path) -> float:
-    """Write a checkpoint as ONNX; the file is complete and checked, or not written.
+    """Write a checkpoint as ONNX and compare the actions; after an error, no file is written.
 
     Returns:
-        The largest difference between the actions of both files on random observations.
+        The largest difference between actions of checkpoint and ONNX file on random observations.
 
     Raises:
-        ValueError: If the checkpoint is invalid or has past actions.
-        CommandError: If this difference is too large.
+        ValueError: If the checkpoint is invalid, or its actor takes past actions as input.
+        CommandError: If the largest difference exceeds `_TOLERANCE`.
         OSError: If the file cannot be written.
     """
     import onnx

@@ -42,8 +42,8 @@ class RelativeGoal:
     - Rotations: the quaternion from the achieved to the desired goal, and 10 times its vector part,
       clipped. The quaternion keeps its sign, because the `gymnasium` success rule distinguishes q
       from -q.
-    - Pen: rotations about its own axis do not count. The cross and dot products of the two axes
-      replace the quaternion.
+    - Pen: rotations about the pen's own axis do not count. Dot and cross product of the pen's
+      achieved and desired axis replace the quaternion.
 
     Parts that do not count for the task are zero. So tasks with the same object can share networks.
 
@@ -143,10 +143,10 @@ GoalFeatures = RelativeGoal | SymmetricObject
 
 
 def goal_features(kind: str, spec: TaskSpec) -> GoalFeatures | None:
-    """Return the features `kind` of a task; None for `plain`, the unchanged observation and goal.
+    """Return the maker of network inputs of a `kind`: `plain`, `relative` or `symmetric`.
 
-    Raises:
-        ValueError: If the kind is unknown, or the task has no symmetric object.
+    It is None for `plain`, the unchanged observation and goal. ValueError for another kind, or for
+    `symmetric` if the goal of the task is no object pose.
     """
     if kind not in GOAL_FEATURES:
         raise ValueError(f'goal_features {kind!r}; allowed: {", ".join(GOAL_FEATURES)}')

@@ -113,7 +113,7 @@ def _session(data: bytes, path: Path) -> Any:
 
 
 def _try_out(data: bytes, path: Path) -> None:
-    """Load and run the file in a process with limited memory and time; ValueError if it fails."""
+    """Run `data`, the file `path`, with limited memory and time; raise ValueError if it fails."""
     # -P: do not import modules of the working directory.
     command = [sys.executable, '-P', '-m', __name__, str(path)]
     environment = os.environ | {'PYTHONPATH': os.pathsep.join(p or os.getcwd() for p in sys.path)}
@@ -138,7 +138,7 @@ def _try_out(data: bytes, path: Path) -> None:
 
 
 def _trial(path: Path) -> int:
-    """Run the ONNX file on standard input once; return 0, or 1 after one error line on stderr."""
+    """Run the ONNX file on stdin, named `path` in errors, once; return 0, or 1 after an error."""
     data = sys.stdin.buffer.read()
     try:
         _require_onnxruntime(path)

@@ -51,11 +51,10 @@ class LoadedPolicy:
 
     Attributes:
         policy: The policy itself, unchecked.
-        task: Name of the task.
         description: Format and file name, for logs and errors.
         control_hz: Action frequency of its training, Hz; None if any frequency is allowed.
         sha256: SHA-256 of its file, or of its concatenated files; empty without a file.
-        is_bounded: Whether actions outside [-1, 1] are errors.
+        is_bounded: Whether actions outside [-1, 1] raise PolicyError; if not, they are returned.
     """
 
     policy: Policy

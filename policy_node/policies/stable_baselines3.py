@@ -65,7 +65,7 @@ class StableBaselines3Policy:
         episode_start: Any = None,
         deterministic: bool = True,
     ) -> tuple[NDArray[Any], Any]:
-        """Return actions (..., action size) in [-1, 1] for one observation or a batch."""
+        """Return actions (..., action size) in [-1, 1], and the state for the next call."""
         seen: Any = dict(observation)
         if self._statistics is not None:
             seen = self._statistics.normalize_obs(seen)

@@ -32,7 +32,7 @@ class EpisodeOutcomes:
         seed: Seed of the episode.
         success_gymnasium: Success at the last step, by the rule `gymnasium` of the released code.
         success_paper: Success at the last step, by the rule in the text of the paper.
-        touched: Success at any step, by the success rule of the simulation.
+        touched: Success at any step before a divergence, by the success rule of the simulation.
         episode_return: Sum of the rewards.
         diverged: The simulation diverged; the episode counts as a failure.
         ticks_reached: Number of ticks with success (rule of the simulation), except the last tick.
@@ -119,7 +119,7 @@ def compare(
 
 
 def summarize(outcomes: EpisodeOutcomes) -> dict[str, Any]:
-    """Return success rates with 95 % intervals, mean return and the measures of `diagnose`."""
+    """Return measures by name: success rates with intervals, mean return, those of `diagnose`."""
     episodes = len(outcomes)
     summary: dict[str, Any] = {'episodes': episodes, 'first_seed': int(outcomes.seed[0])}
     for name in ('success_gymnasium', 'success_paper', 'touched'):
@@ -249,7 +249,7 @@ def training_seeds(sequence: np.random.SeedSequence, count: int) -> list[int]:
 
 
 def success_rate(outcomes: EpisodeOutcomes, success_rule: str) -> float:
-    """Return the success rate at the last step, by the rule `gymnasium` or `paper`."""
+    """Return the success rate at the last step; `success_rule` is `gymnasium` or `paper`."""
     return float(getattr(outcomes, f'success_{success_rule}').mean())
 
 

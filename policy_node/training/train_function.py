@@ -34,8 +34,8 @@ class Run:
         folder: Folder of the run.
         config: Configuration of the run.
         reason: Why the run ended, in words.
-        env_steps: Environment steps of all parts of the run.
-        seconds: Wall-clock time of all parts of the run.
+        env_steps: Environment steps, including those before the run was resumed.
+        seconds: Wall-clock time of training, including the time before the run was resumed.
         best_success: Success at the last step in the best evaluation; -1.0 without an evaluation.
     """
 

@@ -61,7 +61,7 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
 def config_from_arguments(options: argparse.Namespace) -> TrainConfig:
     """Return the configuration that the options choose.
 
-    It is that of the recipe or the resumed run, changed by the options and by `--set`.
+    The recipe or the resumed run gives the values; the options and `--set` replace some of them.
 
     Raises:
         ValueError: If a value is missing, unknown or not allowed.

@@ -34,10 +34,10 @@ class Comparison:
     """The critic's values and the returns at one tick, as means over episodes.
 
     Attributes:
-        tick: Tick of the episodes at which both are taken.
+        tick: Tick of the episodes at which values and returns are taken.
         value: Value of the actor's action.
         episode_return: Discounted training rewards from this tick on.
-        correlation: Correlation of both over episodes; NaN if one of them is constant.
+        correlation: Correlation of values and returns over episodes; NaN if either is constant.
     """
 
     tick: int
@@ -47,10 +47,10 @@ class Comparison:
 
 
 def measure(run: Path, episodes: int) -> list[Comparison]:
-    """Compare the critic's values with returns in new episodes of a run's actor, without noise.
+    """Compare a critic's values with the returns of its actor in new episodes without noise.
 
-    `run` is the folder of the run. The actions are those of the actor that collects, not of the
-    averaged actor. The result has one comparison for each of a few ticks.
+    `run` is the folder of the training run. The actor is the trained one, not its running average.
+    The result has comparisons at 0, 25 and 50 % of the ticks of an episode.
 
     Raises:
         ValueError: If the folder contains no run, or its critic returns no action values.

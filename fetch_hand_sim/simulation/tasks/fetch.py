@@ -128,7 +128,7 @@ class FetchTask(Task):
         gripper_start: (3,) position of the gripper at a reset, m, world.
         object_height: Height of the object's centre at a reset, m; only with an object.
         gripper_rotation: (N, 4) present rotation of the gripper, wxyz; a read-only view.
-        lead_scale: Factor of the gripper offset per action, which keeps the speed at all rates.
+        lead_scale: Factor of the gripper offset at rates other than 25 Hz; 1 if timing is `ticks`.
     """
 
     def __init__(
@@ -284,16 +284,16 @@ class FetchTask(Task):
 
 
 def lead_scale(control_hz: float) -> float:
-    """Return the factor of the gripper offset per action that keeps its speed at 25 Hz."""
+    """Return the factor of the gripper offset per action that gives the gripper speed of 25 Hz."""
     return _steady_speed(DEFAULT_CONTROL_HZ) / _steady_speed(control_hz)
 
 
 def _steady_speed(control_hz: float) -> float:
     """Return the mean speed of the gripper per metre of offset, 1/s, for constant commands.
 
-    The weld to the mocap body is a critically damped spring of frequency w. After a period T from
-    distance 1 and speed w u, the distance is (1 - (u - 1) x) exp(-x) with x = w T. In the steady
-    state, u is the same at the beginning and at the end of a period.
+    The weld to the mocap body is a critically damped spring of frequency w. A period T starts at
+    distance 1 and with speed w u towards the mocap body; after it, the distance is
+    (1 - (u - 1) x) exp(-x), x = w T. In the steady state, u is equal at both ends of a period.
     """
     x = 1.0 / (control_hz * _TIME_CONSTANT)
     decay = math.exp(-x)

@@ -143,7 +143,7 @@ class HandReachTask(HandTask):
         self.batch.state[:] = self.start_state
 
     def reset(self, ids: Ids, generators: Generators) -> Array:
-        """Restore the initial pose and draw goals."""
+        """Restore the initial pose of the simulations `ids`; return new goals (n, 15), m."""
         self.batch.state[ids] = self.start_state
         self.batch.forward(ids)
         return self.sample_goals(ids, generators)

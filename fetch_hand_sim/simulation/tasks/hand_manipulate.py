@@ -110,7 +110,7 @@ class HandManipulateTask(HandTask):
         return self.config.asset
 
     def reset(self, ids: Ids, generators: Generators) -> Array:
-        """Drop the object on the palm until it stays there, then draw goals.
+        """Drop the object on the palm until it stays there; return drawn goals (len(ids), 7).
 
         Attempts that diverge or let the object fall are repeated with the same controls and warm
         start, as in Gymnasium-Robotics. After `_MOST_TRIES` attempts, RuntimeError is raised.
@@ -170,7 +170,7 @@ class HandManipulateTask(HandTask):
     def sample_goal(self, index: int, generator: np.random.Generator) -> Array:
         """Draw a goal pose (7,): the object's present position and a random rotation.
 
-        A random offset is added to the position if the task counts positions.
+        If the position counts (in the `Full` tasks), a random offset is added to it.
         """
         position = self._object_qpos[index, :3].copy()
         if self.spec.position_counts:

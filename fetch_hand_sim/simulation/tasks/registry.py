@@ -27,7 +27,7 @@ def make_task(name: str, batch: BatchConfig | None = None) -> Task:
     """Compile the model of a task and create its batch of simulations.
 
     Raises:
-        ValueError: If the task is unknown or the rate is not allowed. For third-party tasks also if
+        ValueError: If the task or `control_hz` is not allowed. For third-party tasks also if
             the simulation class is missing or compiles another file than its `ASSET`, or if the
             model has a time step other than `PHYSICS_TIMESTEP` or lacks a joint of the task.
     """

@@ -79,7 +79,7 @@ def _stop_timers() -> None:
 
 
 def keep_in_forks(batch: Batch) -> None:
-    """Never free a batch with threads in forked processes, which lack these threads."""
+    """Prevent forked processes from freeing a batch with threads, which they do not have."""
     if batch.nthread > 1:
         _THREADED.add(batch)
 
@@ -100,7 +100,11 @@ Generators = Sequence[np.random.Generator]
 
 @dataclass(frozen=True, slots=True)
 class BatchConfig:
-    """Size and settings of a batch of simulations; `Simulation` explains the fields."""
+    """Size and settings of a batch of simulations.
+
+    `num_threads` 0 uses all processors. With `keeps_data`, each simulation keeps an `MjData`.
+    `timing` is what rates other than 25 Hz keep: an episode's `seconds` or its `ticks`.
+    """
 
     num_envs: int = 1
     num_threads: int = 0
@@ -124,7 +128,7 @@ class Task(ABC):
 
     Attributes:
         model: The compiled `mujoco.MjModel`; the batch steps with a copy.
-        pairs: Listed contact pairs; `follow_model` updates them after changes of their geoms.
+        pairs: The `<pair>` elements of the model; `follow_model` updates those of changed geoms.
         substeps: Physics steps per action.
         tick_duration: Simulated seconds per action.
         draws_goals: Whether `reset` draws goals; otherwise they are zero until the user sets them.
@@ -200,7 +204,7 @@ class Task(ABC):
 
     @abstractmethod
     def apply_commands(self, commands: NDArray[np.floating]) -> None:
-        """Set the actuators or mocap targets for commands (N, action size) within the limits."""
+        """Set actuators or mocap targets from commands (N, action size) in the robot's limits."""
 
     @abstractmethod
     def resting_commands(self) -> Array:
@@ -226,13 +230,13 @@ class Task(ABC):
         self.batch.step(nstep=self.substeps)
 
     def follow_model(self) -> None:
-        """Use the changed `model` from now on: physics, time step and listed contact pairs."""
+        """Apply changes of `model`: physics, time step and `<pair>` elements of changed geoms."""
         self.pairs.follow(self.model)
         self.batch.set_models(self.model)
         self.tick_duration = self.substeps * float(self.model.opt.timestep)
 
     def take_model(self, model: mujoco.MjModel, pairs: ListedPairs) -> None:
-        """Replace the model and its listed contact pairs."""
+        """Copy `model` into `self.model`; use `pairs`, its `<pair>` elements, from now on."""
         self.batch.set_models(model)
         self.batch.get_model(0, self.model)
         self.pairs = pairs
@@ -272,9 +276,9 @@ class Task(ABC):
         return tuple(self._sensors)
 
     def physics_state(self) -> dict[str, Array]:
-        """Return copies of the state (N, state size) and of the derived fields of `output`.
+        """Return copies by name: `state` (N, state size), and derived fields requested by `output`.
 
-        After a step, the derived fields (N, ...) are one substep older than the state.
+        After a step, these derived fields (N, ...) are one substep older than the state.
         """
         outputs = {name: values.copy() for name, values in self._outputs.items()}
         return {'state': self.batch.state.copy(), **outputs}
@@ -332,7 +336,7 @@ class Task(ABC):
         return observation(self.spec, readings, self.tick_duration), goal
 
     def _joint_states(self) -> Array:
-        """Return positions, velocities and efforts of the robot's joints, (N, 3 * joints)."""
+        """Return all positions, then velocities, then efforts of the joints, (N, 3 * joints)."""
         return np.concatenate(
             [
                 self._qpos[:, self.joint_qpos],
@@ -365,7 +369,7 @@ def integration_state(model: mujoco.MjModel, data: mujoco.MjData) -> Array:
 
 
 class SiteMotion:
-    """Maps joint velocities to the velocity of a site, by the Jacobian of MuJoCo's last pass."""
+    """Maps joint velocities to the velocity of a site; Jacobian of the last forward pass."""
 
     def __init__(self, task: Task, site: int) -> None:
         model, body = task.model, int(task.model.site_bodyid[site])

@@ -24,11 +24,10 @@ def is_move(part: CommandPart) -> bool:
 
 
 class Teleoperation:
-    """The command that the sliders and arrow keys of the page change.
+    """Holds the command that the user changes with the sliders and arrow keys of the page.
 
     Args:
-        robot: The robot.
-        start: (action size,) the last command; None for the resting one.
+        start: (action size,) the last command of the robot; None for the resting command.
 
     Attributes:
         values: (action size,) the command, command units.
@@ -82,7 +81,7 @@ class CommandPanel:
         self._teleoperation: Teleoperation | None = None
 
     def draw(self, spec: TaskSpec, picture: Picture) -> None:
-        """Draw the panel, and send a command in every frame while the user has switched it on."""
+        """Draw the panel; while its switch is on, send the sliders' command in every frame."""
         facts = picture.facts
         if self._task != spec.name or not facts.is_commanding:
             self._task, self._teleoperation = spec.name, None

@@ -47,9 +47,7 @@ def moved_goal(
     """Return the goal (goal size,) after the mouse has moved.
 
     Args:
-        spec: The task.
         goal: (goal size,) the goal when the mouse grabbed it.
-        handle: The grabbed point.
         ray: The present ray under the mouse.
         is_turning: Whether to turn a pose, not move it; a pose without position always turns.
         delta: (2,) movement of the mouse since the grab, in widths and heights of the picture.

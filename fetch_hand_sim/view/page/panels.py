@@ -55,7 +55,7 @@ class Panels:
         self._below = 0.0
 
     def draw(self, picture: Picture | None) -> None:
-        """Draw all panels for one frame; None shows that the page waits for a robot."""
+        """Draw all panels for one frame; without a picture, only the text `Waiting for a robot`."""
         size = imgui.GetIO().DisplaySize
         if picture is None:
             x, y = (size.x - WIDTH) / 2.0, size.y / 2.0 - 40.0
@@ -99,7 +99,7 @@ class Panels:
 
 
 def _height(is_shown: bool) -> float:
-    """Return the height in pixels of the current window, or of its button if it is hidden."""
+    """Return the height, pixels, of the current window if it `is_shown`, else of its button."""
     return float(imgui.GetWindowSize().y) if is_shown else _BUTTON_HEIGHT
 
 

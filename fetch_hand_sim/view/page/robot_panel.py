@@ -48,7 +48,7 @@ def introduction(spec: TaskSpec) -> str:
 
 
 class RobotPanel:
-    """Draws the state and the controls of a robot or of an episode file; stores the input."""
+    """Draws state and controls of a robot or episode file; stores the values that users enter."""
 
     def __init__(self, send: Send, goal_panel: GoalPanel) -> None:
         self._send = send
@@ -109,7 +109,7 @@ class RobotPanel:
 
 
 def draw_actors(facts: Facts, send: Send) -> None:
-    """Draw a choice of actors; the active one is listed first if it is not among the choices."""
+    """Draw a combo box of actors; pass a choice to `send`. An unlisted active actor comes first."""
     names, index = list(facts.actors), 0
     if facts.actor in names:
         index = names.index(facts.actor)

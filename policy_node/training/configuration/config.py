@@ -274,7 +274,7 @@ class Ppo:
 
 @dataclass(frozen=True, kw_only=True)
 class Imitation:
-    """Settings of imitation (DAgger): the policy in `init_from` observes the true state."""
+    """Settings of imitation (DAgger). The imitated policy, `init_from`, observes the true state."""
 
     value_weight: Annotated[float, Range(0, 1000)] = 0.0
     """Weight of the value that an action loses against the action of the imitated policy, by its
@@ -679,8 +679,8 @@ def idle_parts(config: TrainConfig, critic_first: int = 0) -> Iterator[str]:
 
     Args:
         config: Configuration of the whole run.
-        critic_first: Updates of the critic before the actor learns, as the learner chose them. A
-            larger `config.critic_first` replaces it.
+        critic_first: Number of first updates in which only the critic learns; ignored if
+            `config.critic_first` is larger.
     """
     c = config
     spec = task_spec(c.task, control_hz=c.control_hz)

@@ -94,9 +94,9 @@ def changed(config: TrainConfig, **changes: Any) -> TrainConfig:
 
 
 def config_from_dict(values: Mapping[str, Any], **changes: Any) -> TrainConfig:
-    """Rebuild the configuration of a stored run from JSON values.
+    """Rebuild the configuration of a stored run from JSON values, with `changes` by the user.
 
-    Fields that the file lacks get their default. Fields that a later version removed are ignored;
+    Missing fields get their default. Fields that a later version removed are ignored;
     `removed_fields` returns them.
 
     Raises:
@@ -107,7 +107,7 @@ def config_from_dict(values: Mapping[str, Any], **changes: Any) -> TrainConfig:
 
 
 def removed_fields(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the values of fields that no longer exist, by name, except their former defaults."""
+    """Return the values of removed fields, by name, that differ from the field's former default."""
     return {n: values[n] for n, default in REMOVED.items() if values.get(n, default) != default}
 
 
@@ -167,11 +167,7 @@ def parse_assignment(text: str) -> tuple[str, Any]:
 
 
 def parse_value(name: str, text: str) -> Any:
-    """Parse `text` into the type of the field `name`.
-
-    Raises:
-        ValueError: If `text` does not fit the type of the field.
-    """
+    """Parse `text` into the type of the field `name`; ValueError if it does not fit."""
     kind = FIELDS[name].kind
     try:
         return _parse(text, kind)

@@ -61,12 +61,12 @@ def recipe_config(task: str, recipe: str, **overrides: Any) -> TrainConfig:
 
 
 def _at_rate(task: str, values: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the changes to `values`, the recipe `best`, for `control_hz` in `overrides`.
+    """Return the fields of `best` (`values`) that change for the `control_hz` in `overrides`.
 
-    At 25 Hz the result is empty. Otherwise step counts change to equal simulated time. Above 25 Hz,
-    the result also sets a discount per 40 ms, exploration noise that lasts 40 ms and n-step returns
-    over 40 ms (docs/research/rates). These are left out if `overrides` has one of them or a similar
-    field (`_DECIDE_AT_RATES`).
+    At 25 Hz the result is empty. Otherwise it has step counts for the same simulated time. Above
+    25 Hz, it also sets a discount per 40 ms, exploration noise that lasts 40 ms and n-step returns
+    over 40 ms (docs/research/rates). If `overrides` has a field of `_DECIDE_AT_RATES`, the result
+    has step counts only.
     """
     control_hz = overrides.get('control_hz', DEFAULT_CONTROL_HZ)
     if control_hz == DEFAULT_CONTROL_HZ:
@@ -83,7 +83,7 @@ def _at_rate(task: str, values: Mapping[str, Any], overrides: Mapping[str, Any])
 def _paper(task: str) -> dict[str, Any]:
     """Return the fields of the paper's appendix B and of `baselines/her/experiment/config.py`.
 
-    Counts are totals of 19 workers with 2 rollouts each.
+    `num_envs`, batch and replay sizes are totals of 19 workers with 2 rollouts each.
     """
     ticks = task_spec(task).episode_ticks
     epochs = 200 if ticks == 100 else 50
@@ -212,9 +212,9 @@ _EXACT = {'FetchSlide': (0.0, (1.0, 0.5)), 'FetchPickAndPlace': (1.0, (1.0, 1.0,
 def _robust(task: str) -> dict[str, Any]:
     """Return the fields of the recipe `robust`, which imitates the shipped policy.
 
-    The robot is disturbed by half of the preset `hardware`, with an action latency of 0 to 2
-    ticks. For FetchSlide and FetchPickAndPlace the scale differs, and the loss also contains the
-    value that actions lose according to a critic (docs/robust_policies.md).
+    The robot has an action latency of 0 to 2 ticks and the preset `hardware`: at half strength,
+    for FetchPickAndPlace at full strength, for FetchSlide not at all. For these two tasks, the
+    loss also penalizes actions of lower value than the shipped policy's (docs/robust_policies.md).
     """
     scale, in_turn = _EXACT.get(task, (0.5, (1.0,)))
     scaled = PRESETS['hardware'].scaled(scale)
@@ -239,9 +239,9 @@ def _object_in_hand(task: str) -> dict[str, Any]:
     """Return the `best` fields for tasks with an object in the hand.
 
     They also apply to third-party tasks whose name does not start with Fetch. The learner draws 51
-    transitions for each environment step, as in the paper. `moved_share` is 0, because an object in
-    the hand always moves. Symmetric inputs halve the training time of the egg; for the block their
-    effect is not decided (docs/lab_notes/training_log.md).
+    transitions for each environment step, as in the paper. Batches do not prefer episodes in which
+    the object moved (`moved_share` is 0), because it always moves here. Symmetric inputs halve the
+    training time of the egg (docs/lab_notes/training_log.md).
     """
     spec = task_spec(task)
     # Turning the egg is learned soonest; recipe `finetune` continues from there.
@@ -261,10 +261,10 @@ def _object_in_hand(task: str) -> dict[str, Any]:
 
 
 def _finetune(task: str) -> dict[str, Any]:
-    """Return the fields of the recipe `finetune`: a shipped policy learns to hold reached goals.
+    """Return the fields of the recipe `finetune`, which trains a shipped policy further.
 
-    With an object in the hand, three settings keep the critic from overestimating values: goals
-    that do not depend on outcomes, a short horizon and rare updates of the actor
+    For block, pen and full egg, three settings keep the critic from overestimating values: no
+    goals from the future of the transition, a short horizon and rare updates of the actor
     (docs/lab_notes/training_log.md).
 
     Raises:

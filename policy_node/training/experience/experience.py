@@ -150,7 +150,7 @@ class Experience:
     def _draw(
         self, mixture: dict[str, float], sampler: TransitionSampler | None = None
     ) -> Transitions:
-        """Draw a batch by `sampler`, if given; `mixture` maps goal sources to probabilities."""
+        """Draw a batch by `sampler` or the usual one; `mixture` maps goal sources to shares."""
         chosen, replay = sampler or self._sampler, self.replay
         row = self._draw_rows()
         return chosen.sample(replay.episodes, row, mixture, self.generator, replay.valid_ticks)

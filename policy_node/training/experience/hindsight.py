@@ -52,10 +52,9 @@ def goal_mixture(strategy: str, k: int = 4, goals: Mapping[str, float] = {}) -> 
 def draw_sources(
     mixture: dict[str, float], count: int, generator: np.random.Generator
 ) -> NDArray[np.intp]:
-    """Draw a goal source for each of `count` transitions.
+    """Return a random goal source for each of `count` transitions, as index of a key of `mixture`.
 
-    `mixture` maps each source to its probability. The result, (count,), contains indices of its
-    keys.
+    `mixture` maps each source to its probability.
     """
     bounds = np.cumsum(list(mixture.values()))
     return np.searchsorted(bounds / bounds[-1], generator.random(count), side='right')
@@ -86,23 +85,23 @@ def goals_of(
 
 
 def _future(starts: Starts, generator: np.random.Generator) -> Array32:
-    """Return goals achieved in the same episode, in the state after the transition or later."""
+    """Return goals achieved in the same episode, at the end of the transition or later."""
     return _achieved(starts, generator.integers(starts.tick + 1, starts.last + 1))
 
 
 def _final(starts: Starts, generator: np.random.Generator) -> Array32:
-    """Return the goals achieved at the last valid state of the same episode."""
+    """Return the goals achieved last in the same episode, except after the object was dropped."""
     del generator
     return _achieved(starts, starts.last)
 
 
 def _episode(starts: Starts, generator: np.random.Generator) -> Array32:
-    """Return goals achieved in any valid state of the same episode, except the first."""
+    """Return goals achieved in the same episode, but not at its start or after a dropped object."""
     return _achieved(starts, generator.integers(1, starts.last + 1))
 
 
 def _random(starts: Starts, generator: np.random.Generator) -> Array32:
-    """Return goals achieved in any valid state of any episode, except the first of each."""
+    """Return goals achieved in any episode, but not at its start or after a dropped object."""
     row = generator.integers(len(starts.episodes), size=len(starts.row))
     return _episode(replace(starts, row=row), generator)
 
@@ -117,8 +116,8 @@ def _displaced(starts: Starts, generator: np.random.Generator) -> Array32:
     """Return goals near the goal achieved at the start of each transition.
 
     The displacement is a motion between two states of a random episode, at most ten ticks apart.
-    It is independent of the transition. In contrast, `future` goals depend on where the transition
-    led. So values are overestimated where contacts make the outcome of a transition random.
+    It is independent of the transition. `future` goals depend on the outcome of the transition and
+    lead to overestimated values where contacts make this outcome random.
     """
     episodes, count = starts.episodes, len(starts.row)
     row = generator.integers(len(episodes), size=count)

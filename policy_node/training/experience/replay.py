@@ -61,8 +61,8 @@ class EpisodeReplay:
         capacity: Largest number of episodes.
         ticks: Steps per episode.
         weigh: Function that returns the weight of each episode for `draw`; None is `has_moved`.
-        count_ticks: Function that returns the number of valid ticks at the start of each episode.
-            Only these are drawn. None makes all ticks valid.
+        count_ticks: Function that returns for each episode how many of its first ticks are valid:
+            only these are learned from. None makes all ticks valid.
 
     Attributes:
         last_added: Number of episodes that the last call of `add` stored.
@@ -148,13 +148,13 @@ class EpisodeReplay:
 
     @property
     def valid_ticks(self) -> NDArray[np.int64] | None:
-        """Number of valid ticks at the start of each stored episode; None if all are valid."""
+        """Number of first ticks to learn from in each stored episode; None if all ticks count."""
         return None if self._count_ticks is None else self._valid[: self._size]
 
     def draw(
         self, count: int, weighted_share: float, generator: np.random.Generator
     ) -> NDArray[np.int64]:
-        """Draw episodes with replacement, with probabilities proportional to their valid ticks.
+        """Draw episodes with replacement, in proportion to their number of ticks to learn from.
 
         Args:
             count: Number of episodes to draw.
@@ -200,8 +200,8 @@ class Starts:
         episodes: The episodes from which the transitions are drawn.
         row: Row number of the episode of each transition, (batch,).
         tick: Tick of the first state of each transition, (batch,).
-        valid_ticks: Number of valid ticks at the start of each episode, (episodes,); None if all
-            ticks are valid.
+        valid_ticks: Number of first ticks of each episode to learn from, (episodes,); None if all
+            ticks count.
     """
 
     episodes: Episodes
@@ -211,7 +211,7 @@ class Starts:
 
     @property
     def last(self) -> NDArray[np.int64]:
-        """Tick of the last valid state in the episode of each transition, (batch,)."""
+        """Tick of the last state to learn from in the episode of each transition, (batch,)."""
         if self.valid_ticks is None:
             return np.full(len(self.row), self.episodes.ticks)
         return self.valid_ticks.take(self.row)

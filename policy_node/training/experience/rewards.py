@@ -67,7 +67,7 @@ def reward_schedule(config: TrainConfig, metric: GoalMetric) -> Callable[[float]
 
 
 def own_reward(metric: GoalMetric) -> str:
-    """Return a description of the reward that a task defines itself, for error messages."""
+    """Return a text for errors that names the reward defined by a third-party task."""
     return f'the reward of {metric.spec.name} itself ({type(metric).__name__})'
 
 

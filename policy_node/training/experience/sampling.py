@@ -35,9 +35,8 @@ class TransitionSampler:
         compute_reward: (achieved_goal, desired_goal) -> reward, batched.
         gamma: Discount per tick.
         most_steps: Longest n-step return; 1 for single transitions.
-        reward_scale: Factor on all rewards.
-        lost_value: Value of the last valid state of an episode that is cut after a drop; None uses
-            the value of the critic.
+        lost_value: Value of the last valid state of an episode that is cut because the object fell;
+            None uses the value of the critic.
         reward_at: Function from the progress of the run, 0 ... 1, to `compute_reward` at that time;
             None if the reward never changes.
         sources: Functions that draw goals, by name of the goal source.
@@ -185,10 +184,10 @@ def sampler_fields(config: TrainConfig, metric: GoalMetric) -> dict[str, Any]:
 def _with_losses(
     starts: Starts, steps: NDArray[np.int64], batch: Transitions, value: float
 ) -> Transitions:
-    """Return the batch without bootstrapping where an episode was cut after a drop.
+    """Return `batch` with `value` in place of bootstrapping where the object has fallen.
 
-    If a transition leads to the last valid state of such an episode, the discounted `value` is
-    added to its reward, and its discount becomes 0.
+    A fall ends the valid ticks of an episode. If a transition leads to the last valid state, the
+    discounted `value` is added to its reward, and its discount becomes 0.
     """
     lost = (starts.tick + steps == starts.last) & (starts.last < starts.episodes.ticks)
     reward = batch.reward + lost * batch.discount * np.float32(value)

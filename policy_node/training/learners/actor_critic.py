@@ -21,7 +21,7 @@ from policy_node.training.machine import Workers
 
 @dataclass(frozen=True, slots=True)
 class Losses:
-    """Losses and mean value of one update.
+    """Losses of critic and actor in one update, and the mean value that the critic estimates.
 
     They stay tensors on the device of the networks, because a conversion to numbers would wait for
     the device.

@@ -85,10 +85,7 @@ class CriticLoss:
         return error
 
     def pooled(self, values: Tensor) -> Tensor:
-        """Combine the values of several critics into one per transition, (batch,).
-
-        With one critic, `values` is returned unchanged.
-        """
+        """Return `values` (batch,) of the one critic unchanged; subclasses pool several critics."""
         return values
 
 

@@ -85,10 +85,9 @@ class ImaginingDDPG(DDPG):
         return value if value.ndim == 1 else value.mean(dim=0)
 
     def _penalty(self, batch: TensorBatch, action: Tensor) -> Tensor:
-        """Return the penalty of `DDPG` plus one for deviating from the actions for subgoals.
+        """Return the actor penalty of `DDPG` plus `subgoal_prior` times a mean squared difference.
 
-        It is `subgoal_prior` times the mean squared difference between `action` and the target
-        actor's actions for imagined subgoals.
+        The difference is between `action` and the target actor's actions for imagined subgoals.
         """
         with torch.no_grad():
             features = self.actor.features(batch.observation, self.imagine(batch.features))

@@ -36,7 +36,7 @@ _ACTING = {'threshold': 0.0, 'horizon': 1.0}
 
 
 def acting_input(config: TrainConfig) -> float | None:
-    """Return the condition with which the actor acts; None if networks have no condition."""
+    """Return the condition for acting: 0 (the task's threshold), 1 (all steps left), else None."""
     return _ACTING.get(config.condition)
 
 
@@ -57,11 +57,9 @@ class ConditionedTransitions(Transitions):
 class ThresholdSampler(TransitionSampler):
     """Draws a success threshold for each transition, as a multiple of the task's threshold.
 
-    Multiples are log-uniform. Coarse goals are reached often, and their value may generalize to
-    fine ones. The widest threshold should be wider than the distance at the start of an episode.
-
-    Attributes:
-        widest: Largest multiple.
+    Multiples are log-uniform from 0.5 to `widest`. Coarse goals are reached often, and their value
+    may generalize to fine ones. The widest threshold should exceed the distance at the start of an
+    episode.
 
     Raises:
         ValueError: If a third-party task defines its own reward.
@@ -143,7 +141,7 @@ def _conditioned(
 
 
 class ConditionedDDPG(DDPG):
-    """`DDPG` whose actor and critic have the condition as an input; arguments as `DDPG`."""
+    """`DDPG` with a condition, success threshold or steps left, as input of actor and critic."""
 
     def _make_networks(self, shape: NetworkShape) -> tuple[Actor, nn.Module]:
         actor, inputs = Actor(shape), shape.feature_size + 1
@@ -151,7 +149,7 @@ class ConditionedDDPG(DDPG):
         return actor, self.critic_loss.make(inputs, shape)
 
     def tensors(self, batch: Transitions) -> TensorBatch:
-        """Return the tensors of `DDPG`, with the condition appended to the features."""
+        """Return `DDPG` tensors whose last feature is the condition: threshold or steps left."""
         assert isinstance(batch, ConditionedTransitions)
         tensors = super().tensors(batch)
         features = torch.cat([tensors.features, self.tensor(batch.condition)], dim=-1)
@@ -160,7 +158,7 @@ class ConditionedDDPG(DDPG):
         return replace(tensors, features=features, next_features=next_features)
 
     def plain(self, network: MLP) -> Actor:
-        """Return an actor without the condition input, which is fixed at `acting_input`."""
+        """Return `network` as an actor whose condition input is fixed at `acting_input`."""
         actor = copy.deepcopy(self.actor)
         actor.network = fold(network, actor.shape, _ACTING[self.config.condition])
         return actor.cpu().eval()
@@ -171,11 +169,7 @@ class ConditionedDDPG(DDPG):
 
 
 def fold(network: MLP, shape: NetworkShape, value: float) -> MLP:
-    """Return a copy of a network without its last input, as if it always were `value`.
-
-    Args:
-        network: Its first layer has `shape.feature_size` + 1 inputs.
-    """
+    """Return a copy of a network of `shape` plus one input; this last input is fixed at `value`."""
     # The new random weights are replaced, so the global generator must not move.
     with torch.random.fork_rng(devices=[]):
         folded = MLP(shape.feature_size, shape.action_size, shape)

@@ -67,7 +67,11 @@ def members_of(tensors: dict[str, Tensor]) -> list[dict[str, Tensor]]:
 
 
 def as_one(members: list[dict[str, Tensor]], critics: int) -> dict[str, Tensor]:
-    """Merge the tensors of at most `critics` members, named as in a run with `critics` critics."""
+    """Merge `members` into one dictionary, the inverse of `members_of`.
+
+    Names are those of a `Critic` if `critics`, the number of critics of the run, is 1. Otherwise
+    they are those of an `Ensemble`; `members` may then be fewer than `critics`.
+    """
     if critics == 1:
         return members[0]
     return {f'members.{i}.{n}': value for i, m in enumerate(members) for n, value in m.items()}
@@ -115,11 +119,11 @@ class QuantileLoss(EnsembleLoss):
 
 
 def sample_of(quantiles: Tensor, truncated: bool) -> Tensor:
-    """Merge the quantiles of all critics into one sample of the return, (batch, kept).
+    """Merge the quantiles of all critics into samples of the return, (batch, samples).
 
     Args:
         quantiles: (critics, batch, count), or (batch, count) of one critic.
-        truncated: Whether the highest quantiles are left out.
+        truncated: Whether to leave out the highest 8 % of the samples, at least one.
     """
     if quantiles.ndim == 2:
         quantiles = quantiles[None]
@@ -136,7 +140,7 @@ def quantile_costs(quantiles: Tensor, target: Tensor) -> Tensor:
 
     Args:
         quantiles: (critics, batch, count), or (batch, count) of one critic.
-        target: (batch, kept), an equally weighted sample of the return.
+        target: (batch, samples), equally weighted samples of the return.
     """
     error = target.unsqueeze(-2) - quantiles.unsqueeze(-1)
     huber = nn.functional.huber_loss(error, torch.zeros_like(error), reduction='none')
@@ -201,9 +205,9 @@ def critic_loss(options: Critics) -> CriticLoss:
 class AdvantageCritic(nn.Module):
     """Two networks: the value of a state and the advantage of an action (DAU, arXiv 1901.09732).
 
-    The more frequent actions are, the less one of them matters. Action values become values of
-    states, and the gradient of the actor vanishes. Here Q(s, a) = V(s) + dt (A(s, a) -
-    A(s, pi(s))). A keeps its size at any dt, and the actor maximizes A.
+    At a high action frequency, one action changes the return little: Q(s, a) is almost V(s), and
+    the gradient of the actor vanishes. Here Q(s, a) = V(s) + dt (A(s, a) - A(s, pi(s))). The actor
+    maximizes A, whose size does not depend on dt.
 
     Args:
         shape: Shape of the actor; both networks have the same hidden layers.
@@ -223,7 +227,7 @@ class AdvantageCritic(nn.Module):
         return value
 
     def forward(self, features: Tensor, action: Tensor, own: Tensor) -> Tensor:
-        """Return the values (batch,) of `action`, given the actor's own actions `own`."""
+        """Return the values (batch,) of `action`; `own` are the actor's actions pi(s)."""
         gain: Tensor = self.advantage(features, action) - self.advantage(features, own)
         return self.value(features) + self._duration * gain
 

@@ -45,7 +45,7 @@ Inputs = tuple[Tensor, Tensor]
 
 
 class DensityRatio(nn.Module):
-    """Two classifiers that separate goals from shuffled ones, without and with the next state."""
+    """Two classifiers that estimate q(g|s, a) / q(g|s, a, s'), the weight of a hindsight goal."""
 
     def __init__(self, feature_size: int, goal_size: int, action_size: int) -> None:
         super().__init__()
@@ -55,7 +55,7 @@ class DensityRatio(nn.Module):
         self.optimizer = torch.optim.Adam(self.parameters(), lr=_LEARNING_RATE)
 
     def update(self, chosen: Inputs, shuffled: Inputs) -> Tensor:
-        """Train the classifiers on chosen and shuffled goals; return weights (batch,), mean 1."""
+        """Train the classifiers; return importance weights of `chosen` goals, (batch,), mean 1."""
         logits = [
             (self.before(before).squeeze(-1), self.after(after).squeeze(-1))
             for before, after in (chosen, shuffled)

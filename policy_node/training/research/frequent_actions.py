@@ -23,13 +23,13 @@ from policy_node.training.learners.ddpg import DDPG, TensorBatch
 
 
 def ticks_of(length: Array32, most: int) -> NDArray[np.int64]:
-    """Convert how long actions hold, from the actor's output in [-1, 1] to ticks, 1 ... `most`."""
+    """Convert the actor's output `length` in [-1, 1] to the ticks an action holds, 1 ... `most`."""
     share = (np.asarray(length, np.float64) + 1.0) / 2.0
     return 1 + np.rint(share * (most - 1)).astype(np.int64)
 
 
 def length_of(ticks: NDArray[np.int64], most: int) -> Array32:
-    """Convert how long actions hold, from ticks, 1 ... `most`, to the actor's output in [-1, 1]."""
+    """Convert the ticks an action holds, 1 ... `most`, to the actor's output in [-1, 1]."""
     return (2.0 * (ticks - 1) / (most - 1) - 1.0).astype(np.float32)
 
 
@@ -72,7 +72,7 @@ class HoldingSampler(TransitionSampler):
     def steps(
         self, starts: Starts, goal: Array32, generator: np.random.Generator
     ) -> NDArray[np.int64]:
-        """Return how many ticks each action still holds, up to the last valid tick, (batch,)."""
+        """Return how many ticks each action still holds, at most up to `starts.last`, (batch,)."""
         del goal, generator
         length = starts.episodes.action[starts.row, starts.tick, -1]
         left: NDArray[np.int64] = starts.last - starts.tick
@@ -132,10 +132,10 @@ class PerturbedActors(MemorylessPolicy):
 class PerturbingCollector(Collector):
     """Collector with noise on the actor's weights, constant within an episode (arXiv 1706.01905).
 
-    The scale of the noise adapts until actions move by `noise_std` (root mean square). After every
-    cycle it is multiplied by the ratio of wanted to measured distance, limited to 1/2 ... 2. The
-    cited paper changes it by 1 % at a time, which is too slow for a few dozen cycles of long
-    episodes. Arguments as `Collector`.
+    The noise is scaled until it changes actions by `noise_std` (root mean square). After every
+    cycle, its scale is multiplied by wanted / measured change, limited to 1/2 ... 2. The cited
+    paper changes the scale by 1 % at a time, too slowly for a few dozen cycles of long episodes.
+    Arguments as `Collector`.
     """
 
     def __init__(self, simulation: Simulation, seeds: list[int], config: TrainConfig) -> None:

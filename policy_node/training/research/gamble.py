@@ -66,7 +66,7 @@ class GambleSimulation(Simulation):
             self._landing[index] = self._task.sample_goal(index, self.generator(index))
 
     def step(self, actions: ArrayLike) -> StepResult:
-        """Step as `Simulation.step` does; a gamble ends the motion of its episode."""
+        """Step as in `Simulation.step`; a gripper action above 0.9 (a gamble) ends the motion."""
         result = super().step(actions)
         # If a simulation diverged, the action belonged to the episode before.
         may_gamble = ~(self._over | result.diverged)
@@ -117,7 +117,7 @@ def without_landings(episodes: Episodes, spec: TaskSpec) -> Episodes:
 
 
 def _parts(spec: TaskSpec) -> dict[str, slice]:
-    """Return the slice of each part of an observation, by name."""
+    """Return the slice of each part of an observation by name, such as `gripper_state`."""
     starts = np.cumsum([0, *(part.size for part in spec.observation)]).tolist()
     return {
         part.name: slice(start, start + part.size)

@@ -43,7 +43,7 @@ _SMALLEST_NORM = 1e-6
 
 
 def subgoals_of(starts: Starts, generator: np.random.Generator | None = None) -> Array32:
-    """Return the subgoals (batch, goal_size) pursued in the states `starts`; ignore `generator`."""
+    """Return the subgoals (batch, goal_size) of the states `starts`; `generator` is unused."""
     del generator
     episodes = starts.episodes
     size = episodes.desired_goal.shape[-1]
@@ -180,11 +180,7 @@ def with_subgoals(mixture: dict[str, float]) -> dict[str, float]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class HierarchicalTransitions(Transitions):
-    """A batch for the actor, together with a batch for the high level.
-
-    Attributes:
-        high: Batch for the high level, whose actions are goals (batch, goal_size).
-    """
+    """A batch for the actor; `high` is the batch for the high level, whose actions are goals."""
 
     high: Transitions
 
@@ -193,7 +189,8 @@ class HierarchicalTransitions(Transitions):
 class SubgoalSampler(TransitionSampler):
     """Draws transitions of the high level, each over `subgoal_every` ticks.
 
-    Tested subgoals that the actor missed get `missed_value` as their value.
+    The actor pursues tested subgoals without noise. If it missed one, the transition ends with the
+    reward `missed_value`, the lowest possible return.
     """
 
     missed_value: float
@@ -208,7 +205,7 @@ class SubgoalSampler(TransitionSampler):
     ) -> Transitions:
         """Draw transitions of the high level; arguments as `TransitionSampler.sample`.
 
-        Episodes must have at least as many ticks as a subgoal.
+        `valid_ticks` is ignored. Episodes must have at least as many ticks as a subgoal.
         """
         del valid_ticks
         starts = Starts(episodes, row, self._ticks(episodes, len(row), generator))
@@ -233,7 +230,7 @@ class SubgoalSampler(TransitionSampler):
     def _with_tests(self, starts: Starts, batch: Transitions) -> Transitions:
         """Return the batch with a penalty for tested subgoals that were missed.
 
-        Their transitions get the subgoal as action and the lowest possible value, for any goal.
+        Their transitions have the subgoal as action, the reward `missed_value` and discount 0.
         """
         subgoal = subgoals_of(starts)
         pairs = batch.action.astype(np.float64), subgoal.astype(np.float64)
@@ -270,7 +267,7 @@ class HierarchicalExperience(Experience):
 
 
 class HighLevel(DDPG):
-    """`DDPG` of the high level, whose actions are goals; it uses the normalizers of `low`."""
+    """`DDPG` of the high level: its actions are goals for `low`, whose normalizers it shares."""
 
     def __init__(self, shape: NetworkShape, low: DDPG) -> None:
         # A penalty of large actions would prefer goals in the middle of all goals.
@@ -282,7 +279,7 @@ class HighLevel(DDPG):
         self._is_pose = task_spec(config.task).goal is GoalKind.POSE
 
     def tensors(self, batch: Transitions) -> TensorBatch:
-        """Return the tensors of `DDPG`; the actions, which are goals, are scaled to [-1, 1]."""
+        """Convert a batch to tensors as `DDPG` does, with the actions (goals) scaled to [-1, 1]."""
         tensors = super().tensors(batch)
         action = self.actor.goal_normalizer(tensors.action) / NORMALIZED_CLIP
         return replace(tensors, action=action)
@@ -314,7 +311,7 @@ class HierarchicalDDPG(DDPG):
         self.high.average()
 
     def set_progress(self, progress: float) -> None:
-        """Set the learning rates of both levels to those at `progress`."""
+        """Set the learning rates of both levels for `progress`, the finished share of the run."""
         super().set_progress(progress)
         self.high.set_progress(progress)
 
@@ -324,7 +321,7 @@ class HierarchicalDDPG(DDPG):
         return self._guided(actor, self.high.proposer()) if self.updates else actor
 
     def other_policies(self) -> dict[str, Policy]:
-        """Return both levels as one policy to evaluate; nothing before the first update."""
+        """Return both levels as one policy, named `eval_guided`; {} before the first update."""
         if not self.updates:
             return {}
         both = self._guided(self.evaluation_actor(), self.high.proposer(averaged=True))

@@ -94,7 +94,7 @@ class ChoosingSampler(TransitionSampler):
 
 @dataclass(frozen=True, kw_only=True)
 class LambdaSampler(TransitionSampler):
-    """Draws n-step returns of random n; their mean is the truncated lambda-return for `trace`."""
+    """Draws n-step returns of random n; their mean is the truncated lambda-return of `trace`."""
 
     trace: float = 0.7
 
@@ -152,6 +152,6 @@ class JudgedExperience(Experience):
         self.judged = self.judged.at(progress)
 
     def batch(self, env_steps: int) -> Transitions:
-        """Draw the transitions for one update from `judged`."""
+        """Draw the transitions for one update from `judged`; `env_steps` is not used."""
         del env_steps
         return self._draw(self.mixture(), self.judged)

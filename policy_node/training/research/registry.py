@@ -1,4 +1,4 @@
-"""Select the parts of a run: the usual ones, or those that a study puts in their place.
+"""Select simulation, collector, sampler and learner of a run: the usual or those of a study.
 
 This is the only module of the folder that other folders import.
 """
@@ -124,7 +124,7 @@ def make_learner(
     workers: Workers,
     generator: np.random.Generator,
 ) -> tuple[ActorCritic, Experience]:
-    """Return the learner and its experience.
+    """Return the learner that the configuration selects, and the `Experience` of its batches.
 
     Raises:
         ValueError: If the configuration would replace the reward that a third-party task defines.
@@ -167,7 +167,7 @@ def _extra_actions(config: TrainConfig) -> int:
 def _weights_of(config: TrainConfig, spec: TaskSpec) -> Weigh:
     """Return a function that weights episodes by 1 if the achieved goal moved, otherwise by 0.
 
-    In a task with a gamble, the motion to a landing does not count.
+    With `config.gamble`, the jump to a landing does not count as a motion.
     """
     if not config.gamble:
         return has_moved

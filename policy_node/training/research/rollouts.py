@@ -112,7 +112,6 @@ class RolloutMaker:
         """Compute the transitions of episodes, with advantages, for their `desired_goal`.
 
         Args:
-            episodes: Episodes, perhaps with relabelled goals.
             meant: Log probabilities (episodes, T) of the actions for the goals before relabelling,
                 for importance weights; None if the goals are the original ones.
 
@@ -209,7 +208,7 @@ class Outcomes:
         return len(self.after)
 
     def goals(self, starts: Starts, generator: np.random.Generator) -> Array32:
-        """Return one goal per episode, (batch, goal_size): the outcome nearest to its desired goal.
+        """Return one goal per episode, (batch, goal_size): the outcome nearest to the desired goal.
 
         A few outcomes are drawn. The motion from `before` to `after` of each is applied to the goal
         achieved at the start of the episode. Without outcomes, the desired goals are returned.
@@ -252,7 +251,8 @@ class OnPolicyExperience(Experience):
 
     Args:
         config: The configuration; `trace` is the lambda of the advantages.
-        weigh: Returns the weight of each episode, by which `moved_share` of a batch is drawn.
+        weigh: Returns the weight of each episode. The share `moved_share` of a batch is drawn in
+            proportion to these weights, the rest with equal probability.
     """
 
     def __init__(
@@ -276,7 +276,7 @@ class OnPolicyExperience(Experience):
         self._weight_up_to = np.zeros(0)
 
     def batch(self, env_steps: int) -> Transitions:
-        """Draw from the rollouts of the newest cycle; the first call of a cycle makes these."""
+        """Draw transitions of the newest cycle, which are recomputed if `env_steps` has changed."""
         if self._rollouts is None or env_steps != self._made_after:
             self._rollouts, self._made_after = self._roll_out(), env_steps
         row, ticks = self._draw_rows(), self.replay.ticks

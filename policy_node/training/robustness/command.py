@@ -1,7 +1,7 @@
-"""Measure the success of a policy under ten disturbances at rising levels and under the presets.
+"""Measure the success rate of a policy under up to ten disturbances and under the presets.
 
-The result is a JSON file, a CSV file and a figure. After an interruption the same command continues
-with the missing points.
+A point is a preset or one of several levels of a disturbance. The result is a JSON file, a CSV file
+and a figure. After an interruption, the same command evaluates only the missing points.
 """
 
 from __future__ import annotations
@@ -105,7 +105,7 @@ def _run(options: argparse.Namespace) -> int:
 def _start(
     options: argparse.Namespace, loaded: LoadedPolicy, simulation: Simulation, file: Path
 ) -> dict[str, Any]:
-    """Return the result before the evaluation, with the points that `file` already contains.
+    """Return the settings of this evaluation, with the points that `file` already contains.
 
     Raises:
         UsageError: If `file` is not a result of this policy with the same settings.
@@ -156,7 +156,7 @@ def _measure_in_worker(point: Point) -> dict[str, Any]:
 def _measured_in_workers(
     options: argparse.Namespace, missing: Sequence[Point]
 ) -> Iterator[dict[str, Any]]:
-    """Evaluate points in several processes; yield the results in the order of the points."""
+    """Evaluate points in several processes; yield the result of `_measured` for each, in order."""
     jobs = min(options.jobs, len(missing))
     threads = options.threads or max(1, len(os.sched_getaffinity(0)) // jobs)
     own = argparse.Namespace(**{**vars(options), 'threads': threads})
@@ -177,7 +177,7 @@ def _measure(
     loaded: LoadedPolicy,
     file: Path,
 ) -> None:
-    """Evaluate the points that `result` lacks; write the file after each of them."""
+    """Evaluate the points that `result` lacks and add them; write `file` after each of them."""
     missing = [each for each in points(simulation.spec) if each.key not in result['points']]
     if options.jobs > 1 and missing:
         found = _measured_in_workers(options, missing)
@@ -193,7 +193,7 @@ def _measure(
 def _measured(
     options: argparse.Namespace, simulation: Simulation, loaded: LoadedPolicy, point: Point
 ) -> dict[str, Any]:
-    """Evaluate the policy at one point; return its entry of the result file."""
+    """Evaluate the policy at one point; return its entry of the JSON file, such as its success."""
     simulation.disturbances = point.disturbances
     bounded = replace(loaded, is_bounded=True)
     outcomes = evaluate(simulation, bounded, options.episodes, options.first_seed)
@@ -210,7 +210,7 @@ def _measured(
 
 
 def _to_csv(result: dict[str, Any]) -> bytes:
-    """Return a CSV file with a row per point."""
+    """Return a CSV file with a row per point, a disturbance at one level."""
     before, after = ['disturbance', 'level', 'success'], ['dropped', 'diverged']
     rows = (
         [*(each[n] for n in before), *each['success_interval_95'], *(each[n] for n in after)]

@@ -75,7 +75,7 @@ SWEEPS = (
 
 @dataclass(frozen=True, slots=True)
 class Point:
-    """One evaluation: a disturbance at a level, a preset (level 1), or `none`."""
+    """One evaluation of a curve: a disturbance at a level, a preset (level 1) or `none`."""
 
     name: str
     level: float
@@ -88,7 +88,7 @@ class Point:
 
 
 def points(spec: TaskSpec) -> Iterator[Point]:
-    """Yield the points of a task's curve, the undisturbed one first."""
+    """Yield the evaluations of a task's robustness curve, the undisturbed one first."""
     yield Point('none', 0.0, Disturbances())
     for sweep in sweeps_of(spec):
         for level in sweep.levels:
@@ -103,13 +103,9 @@ def sweeps_of(spec: TaskSpec) -> Sequence[Sweep]:
 
 
 def kept_up_to(sweep: Sweep, success: Mapping[str, float], undisturbed: float) -> float | None:
-    """Return the highest level a policy withstands; it keeps `KEPT` of its success up to there.
+    """Return the highest level up to which a policy keeps 90 % of the success rate `undisturbed`.
 
-    Args:
-        success: Success by `Point.key`.
-
-    Returns:
-        The level; None if the policy does not withstand the first level.
+    `success` has success rates by `Point.key`. Return None if the first level is too high.
     """
     kept = None
     for level in sweep.levels:
@@ -120,7 +116,10 @@ def kept_up_to(sweep: Sweep, success: Mapping[str, float], undisturbed: float) -
 
 
 def sentence(spec: TaskSpec, control_hz: float, success: Mapping[str, float]) -> str:
-    """Return one sentence with the levels of each disturbance that a policy withstands."""
+    """Return a sentence: up to which level of each disturbance a policy keeps 90 % of its success.
+
+    `success` has success rates by `Point.key`; `control_hz` converts latencies from ticks to ms.
+    """
     if not success['none 0']:
         return f'{spec.name}: no success without disturbances, so there is none to keep.'
     kept, lost = [], []

@@ -72,7 +72,7 @@ class ImitationTrainer(BaseTrainer):
         init_from: The networks to imitate, from which the imitating actor starts too.
 
     Raises:
-        ValueError: With several workers, or if the critic for `value_weight` is missing.
+        ValueError: With several workers, or if `value_weight` is set and `init_from` has no critic.
     """
 
     def __init__(

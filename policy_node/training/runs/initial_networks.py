@@ -86,7 +86,7 @@ class InitialNetworks:
           become zero. In the old task the goal position equalled that of the object, so the
           networks have learnt nothing from it. Otherwise an actor that dropped 1 block in 200
           would drop half.
-        - A condition input may be added. Added inputs have zero weights.
+        - With the field `condition`, one input is added. Added inputs have zero weights.
 
         Raises:
             ValueError: If the run cannot start from these networks.
@@ -267,9 +267,10 @@ def _read_usual(file: Path, source: Path) -> tuple[TrainingState, TrainConfig]:
 
 
 def _unconditioned(tensors: dict[str, Tensor], config: TrainConfig) -> dict[str, Tensor]:
-    """Return networks without the `condition` input, which is fixed at its value for acting.
+    """Return networks without the input for `condition` (success threshold or steps left).
 
-    Networks without such an input are returned unchanged.
+    The biases include the constant value of this input with which the actor acts. Networks without
+    such an input are returned unchanged.
     """
     value = acting_input(config)
     if value is None:

@@ -140,7 +140,7 @@ class RunFolder:
     def save_when_due(
         self, learner: ActorCritic, experience: Experience, counters: Counters
     ) -> None:
-        """Write a checkpoint if `checkpoint_seconds` have passed; save the replay less often.
+        """Write a checkpoint if the last is `checkpoint_seconds` old; add the replay every 900 s.
 
         If a file cannot be written, for example on a full disk, only warn.
         """
@@ -165,7 +165,7 @@ class RunFolder:
         Without `with_replay`, the earlier file of episodes stays.
 
         Raises:
-            OSError: If a file cannot be written; the earlier files stay.
+            OSError: If a file cannot be written; its earlier version stays.
         """
         self._last_checkpoint = time.monotonic()
         if with_replay:

@@ -113,7 +113,7 @@ class RunLog:
             self._on_row(row)
 
     def close(self) -> None:
-        """Finish the live line in the terminal and close the files."""
+        """Stop updating the progress line in the terminal and close the files."""
         discard_unread_output()
         if self._live.is_started:
             self._live.stop()

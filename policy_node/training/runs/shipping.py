@@ -49,7 +49,6 @@ def ship(
     The better actor has the higher success rate or, at equal rates, the higher mean return.
 
     Args:
-        run: Folder of the run.
         actors: Folder of the shipped actors.
         episodes: Number of evaluated episodes.
         name: File of the actor in `run`.

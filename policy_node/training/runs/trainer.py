@@ -82,7 +82,7 @@ class Collected:
 
 
 class BaseTrainer:
-    """Base class of trainers: simulations, run folder, counters and the end of a run.
+    """Base class of trainers. It evaluates policies, counts steps and decides when a run ends.
 
     Args:
         origin: Origin of the initial networks, for the record; empty if they are random.
@@ -124,7 +124,7 @@ class BaseTrainer:
         return (reason or 'another worker stopped') if self.workers.any(bool(reason)) else ''
 
     def _ended(self) -> tuple[str, str] | None:
-        """Return the `TrainConfig` field whose limit is reached, and a reason; None without one."""
+        """Return the reached limit as (name of its `TrainConfig` field, message), or None."""
         config, counters = self.config, self.counters
         if 0 < config.success_target <= counters.best_success:
             return 'success_target', f'success target {config.success_target:g} reached'
@@ -212,7 +212,7 @@ class Trainer(BaseTrainer):
         return {**self.learner.modules(), **self.experience.statistics}
 
     def _seed(self, env_steps: int) -> np.random.Generator:
-        """Set `collector` to one with new seeds; return a random generator that draws batches.
+        """Replace `collector` by a new one; return a random generator that draws batches.
 
         The seeds of both depend on the seed of the run, the worker and `env_steps`.
         """
@@ -258,9 +258,9 @@ class Trainer(BaseTrainer):
             )
 
     def _let_critic_learn_first(self) -> None:
-        """Train only the critics for `CRITIC_FIRST` updates if some of them started untrained.
+        """Let only the critics learn in the first `CRITIC_FIRST` updates if `init_from` lacks some.
 
-        A `critic_first` other than 0 in the configuration replaces `CRITIC_FIRST`.
+        Do nothing if `critic_first` of the configuration is not 0, because it sets the number.
         """
         origin = self._folder.init_from
         critics = self.config.critics
@@ -342,7 +342,7 @@ class Trainer(BaseTrainer):
         return collected
 
     def _warn_of_rewards(self, episodes: Episodes) -> None:
-        """Warn if rewards of a third-party task exceed 0, because values are clipped to 0."""
+        """Warn if rewards of a third-party task exceed 0, because learnt values are at most 0."""
         metric = self.simulation.metric
         if self.config.algorithm == 'ppo' or not metric.has_own_reward:
             return

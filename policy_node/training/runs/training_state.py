@@ -34,7 +34,7 @@ _ADAM = {'step', 'exp_avg', 'exp_avg_sq'}
 
 @dataclass(slots=True)
 class Counters:
-    """The progress of a run since its first start, including the time before interruptions.
+    """The progress of a run since its first start; a resumed run continues to count.
 
     Attributes:
         env_steps: Environment steps of all workers.
@@ -58,10 +58,7 @@ class Counters:
 
 
 class RunClock:
-    """Measures the wall-clock and CPU time of a run and writes it into its counters.
-
-    The time of earlier parts of a resumed run is included.
-    """
+    """Measures the wall-clock and CPU time of a run, from its first start on, for `counters`."""
 
     def __init__(self, counters: Counters) -> None:
         self._counters = counters
@@ -122,9 +119,9 @@ def state_bytes(state: TrainingState) -> bytes:
 
 
 def require_readable(learner: ActorCritic) -> None:
-    """Raise ValueError if the networks would make files that are too large to be read again.
+    """Raise ValueError if the actor file would exceed 64 MiB, or the training state file 1 GiB.
 
-    The trainer calls this before it trains for hours.
+    This project reads no larger files. The trainer calls this function before it trains for hours.
     """
     actor = sum(value.nbytes for value in learner.actor.state_dict().values())
     modules, optimizers = learner.modules().values(), learner.optimizers().values()
@@ -223,10 +220,11 @@ def load_state(path: Path, learner: ActorCritic, modules: dict[str, nn.Module]) 
 
 @contextmanager
 def fitting(source: object) -> Iterator[None]:
-    """Turn errors of the block, which loads tensors, into a ValueError that names `source`.
+    """Context manager for a block that loads the tensors of `source`, the name of a file or policy.
 
     Raises:
-        ValueError: If the tensors do not fit; the message is one line.
+        ValueError: If the block raises because tensors do not fit the networks of the
+            configuration; the message is one line with `source`.
     """
     try:
         yield
@@ -240,13 +238,13 @@ def fitting(source: object) -> Iterator[None]:
 
 
 def load_networks(tensors: dict[str, Tensor], modules: dict[str, nn.Module]) -> None:
-    """Load tensors into networks and statistics.
+    """Load `tensors` into `modules`, the networks and normalizer statistics by name.
 
     Missing target networks and a missing averaged actor become copies of actor and critic. If the
     critic is missing, its module keeps its weights.
 
     Raises:
-        RuntimeError: If sizes do not fit or a part is incomplete.
+        RuntimeError: If sizes do not fit, or tensors other than a whole critic are missing.
     """
     tensors = _with_copies(tensors, modules)
     for part, module in modules.items():
@@ -265,9 +263,9 @@ def part_of(tensors: dict[str, Tensor], part: str) -> dict[str, Tensor]:
 
 
 def _with_copies(tensors: dict[str, Tensor], modules: Iterable[str]) -> dict[str, Tensor]:
-    """Add missing target networks and a missing averaged actor as copies of actor and critic.
+    """Return `tensors`, with copies of actor and critic for missing target and averaged networks.
 
-    `modules` are the names of the parts that a run needs.
+    `modules` are the names of the networks and statistics that a run needs.
     """
     sources = {
         'target_actor': 'actor.network',
@@ -308,7 +306,7 @@ class TrainingError(RuntimeError):
 
 
 def require_finite(values: Iterable[tuple[str, Any]], counters: Counters) -> None:
-    """Raise `TrainingError` if one of the named arrays or tensors contains NaN or infinity."""
+    """Raise `TrainingError`, with the steps of `counters`, if a named value has NaN or infinity."""
     for name, value in values:
         if not np.isfinite(np.asarray(value)).all():
             raise TrainingError(

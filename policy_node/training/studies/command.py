@@ -240,7 +240,7 @@ def _place(
 
 
 def _ship_all(options: argparse.Namespace, jobs: Sequence[Job], output: Path, report: Path) -> bool:
-    """Evaluate the best actor of each job; copy those that beat the shipped ones.
+    """Evaluate the best actor of each job; copy it to `--actors` if it beats the actor there.
 
     Return False if an evaluation or a copy failed.
     """

@@ -43,16 +43,16 @@ class Curve:
 
     @classmethod
     def of(cls, run: Mapping[str, Any]) -> Curve:
-        """Return the curve of a stored run."""
+        """Return the curve of a run, given as a line of `runs.jsonl`."""
         return cls(*np.array(run['curve'], np.float64).reshape(-1, 2).T)
 
 
 def measure_run(job: Job, command: str) -> dict[str, Any]:
-    """Measure a trained job on fresh episodes and return its line of `runs.jsonl`.
+    """Evaluate a trained job on fresh episodes; return its results as a line of `runs.jsonl`.
 
     `steps_to_0.9` is the number of steps of 40 ms until an evaluation first reached a success rate
     of 0.9, or None. `parts` counts how often the run was started. A resumed run (`parts` > 1) has
-    other training episodes than an uninterrupted one.
+    other training episodes than an uninterrupted one. `command` is only recorded.
 
     Raises:
         ValueError: If the log has no evaluation or a file of the run is damaged.
@@ -117,10 +117,9 @@ def area_under(curve: Curve, total_steps: int) -> float:
 
 
 def area_in_time(run: Mapping[str, Any], seconds: float) -> float:
-    """Return the mean success over the first `seconds` of processor time of a stored run.
+    """Return the mean success over the first `seconds` of CPU time of a line of `runs.jsonl`.
 
-    All steps of a run are assumed to cost the same. A run that took less time keeps its last
-    success.
+    All steps are assumed to cost the same. After the end of a run, its last success counts.
     """
     curve = Curve.of(run)
     share = max(seconds, _SHORTEST) / max(run['processor_seconds'], _SHORTEST)
@@ -138,9 +137,9 @@ def sum_up(runs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Return medians and quartiles over the seeds of one variant: one row of `arms.csv`.
 
     Args:
-        runs: Stored runs of the variant. Their `area_in_time` is None if the baseline has no run on
-            the same machine. Such runs are excluded from the measures of time; `timed` in the
-            result counts the others.
+        runs: Runs of the variant, as in `runs.jsonl`, with `area_in_time`. This is None if the
+            baseline has no run on the same machine. Measures of time exclude such runs; the
+            column `timed` counts the included ones.
     """
     first, name_of_steps = runs[0], f'steps_to_{GOOD_SUCCESS}'
     timed = [run for run in runs if run['area_in_time'] is not None]
@@ -169,10 +168,10 @@ def _quartiles(name: str, values: Sequence[float]) -> dict[str, float | str]:
 
 
 def is_significant(arm: Mapping[str, Any], baseline: Mapping[str, Any], name: str) -> bool:
-    """Return whether two variants differ in the measure `name`: quartile ranges disjoint, p <= .05.
+    """Return whether two variants, rows of `arms.csv`, differ in the measure `name`.
 
-    Disjoint ranges alone are too weak a test: two equal variants of five seeds have them in 52 of
-    the 252 possible orders. `arm` and `baseline` are rows of `arms.csv`.
+    They differ if their quartile ranges are disjoint and p <= 0.05. Disjoint ranges alone are too
+    weak: equal variants of five seeds have them in 52 of the 252 possible orders.
     """
     below = arm[f'{name}_upper'] < baseline[f'{name}_lower']
     above = baseline[f'{name}_upper'] < arm[f'{name}_lower']
@@ -182,7 +181,7 @@ def is_significant(arm: Mapping[str, Any], baseline: Mapping[str, Any], name: st
 def compared(
     runs: Sequence[Mapping[str, Any]], baseline: Sequence[Mapping[str, Any]]
 ) -> dict[str, float | str]:
-    """Return `<measure>_p`, the p-values against the baseline; '' if a group lacks the measure."""
+    """Return the rank-sum p-value of each measure, by `<measure>_p`; '' without values."""
     found: dict[str, float | str] = {}
     for name in COMPARED:
         first, second = (

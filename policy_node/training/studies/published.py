@@ -83,7 +83,7 @@ _NOT_PUBLISHED = 'no number found'
 
 
 def actors_table(actors: Path) -> str:
-    """Return a Markdown table of the evaluated actors in a folder.
+    """Return a Markdown table with a row for each evaluation `<task>.json` in a folder.
 
     Raises:
         ValueError: If a file is no evaluation of an actor; the message names the file.
@@ -96,7 +96,7 @@ def actors_table(actors: Path) -> str:
 
 
 def actors_summary(actors: Path) -> str:
-    """Return a short form of `actors_table` with five columns.
+    """Return a short table of all evaluations `<task>.json` in a folder, with five columns.
 
     Raises:
         ValueError: If a file is no evaluation of an actor; the message names the file.

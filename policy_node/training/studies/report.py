@@ -49,7 +49,7 @@ class Band:
 
 
 def write_study(study: Study, output: Path) -> None:
-    """Write the tables and the figure of a study from its runs; nothing without runs.
+    """Write the tables and the figure of a study from its runs; do nothing if it has no runs.
 
     `arms.csv` holds medians and quartiles. `README.md` keeps what the user wrote around its table.
 
@@ -105,11 +105,11 @@ def _grouped(runs: Sequence[Run], name: str) -> dict[str, list[Run]]:
 
 
 def _timed(run: Run, seconds: Mapping[str, float]) -> Run:
-    """Return a run with `area_in_time`, its mean success in the time that the baseline needs.
+    """Return a copy of a run with `area_in_time`: the mean success within the baseline's time.
 
     Args:
-        seconds: Median processor time of the baseline, by machine. If the machine of `run` is
-            missing here, `area_in_time` becomes None.
+        seconds: Median processor time of the baseline, s, by machine. If it lacks the machine of
+            `run`, `area_in_time` is None.
     """
     known = seconds.get(run['machine'])
     return {**run, 'area_in_time': None if known is None else area_in_time(run, known)}
@@ -161,7 +161,7 @@ def format_study(study: Study, arms: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _times(row: Mapping[str, Any]) -> tuple[str, str, str]:
-    """Return the table cells of processor time, area in equal time and samples per second."""
+    """Return the cells of processor time, mean success in equal time and samples per second."""
     if not row['timed']:
         return ('-',) * 3
     some = '' if row['timed'] == row['seeds'] else f', of {row["timed"]}'
@@ -205,7 +205,7 @@ def _quartiles(row: Mapping[str, Any], name: str) -> str:
 def _with_table(page: str, table: str) -> bytes:
     """Return the text of a page with `table` between the lines `BEGIN` and `END`, as bytes.
 
-    A page without these lines stays unchanged; an empty page gets both.
+    An empty page gets these lines and the table. Another page without the lines stays unchanged.
     """
     text = page or f'{BEGIN}\n{END}\n'
     if BEGIN in text and END in text:

@@ -129,7 +129,7 @@ def _paper_settings(task: str) -> dict[str, Any]:
 
 
 def _returns() -> Iterator[Arm]:
-    """Yield variants with one-step returns, and with longer returns for each `correction`."""
+    """Yield variants: returns of 1 step, and of 3, 5 or 10 with each off-policy `correction`."""
     yield _arm('one', 'one step', n_step=1)
     for steps, correction in product((3, 5, 10), ('none', 'lambda', 'cut')):
         label = f'{steps} steps, correction {correction}'
@@ -165,7 +165,7 @@ def _ensembles() -> Iterator[Arm]:
 
 
 def _rates() -> Iterator[Arm]:
-    """Yield the recipe at 250, 125 and 25 Hz, and changes that may help at 250 Hz."""
+    """Yield variants: the recipe at 250, 125 and 25 Hz, and changes that may help at 250 Hz."""
     for rate in (250, 125, 25):
         label = f'{rate} Hz, as it is'
         yield _arm(f'plain{rate}', label, control_hz=float(rate), discount='tick')

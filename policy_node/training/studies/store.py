@@ -46,11 +46,7 @@ def read_runs(folder: Path) -> Runs:
 
 
 def add_run(folder: Path, run: Mapping[str, Any]) -> None:
-    """Append a run to the file `runs.jsonl` of a report folder.
-
-    Raises:
-        OSError: If writing fails, for example on a full disk. The file is unchanged.
-    """
+    """Append a run to `runs.jsonl` of a report folder; after an OSError the file is unchanged."""
     file, line = folder / RUNS, json.dumps(run, separators=(',', ':'))
     with alone_in(folder):
         stored = file.read_bytes() if file.is_file() else b''
@@ -69,7 +65,7 @@ def in_order(runs: Iterable[Run], study: Study) -> list[Run]:
 
 
 def holds(runs: Runs, job: Job) -> bool:
-    """Return whether `runs` has this job, with equal configuration and number of final episodes."""
+    """Return whether `runs` has a run of `job` with equal configuration and `final_episodes`."""
     run = runs.get(job.key)
     if run is None or run['final_episodes'] != job.final_episodes:
         return False

@@ -58,8 +58,7 @@ class Arm:
         label: Name in figures and tables.
         changes: Fields of `TrainConfig` that only this variant sets.
         factors: Integer fields, and the factor by which this variant multiplies their common value.
-        after: Variant whose run of the same task and seed trains the networks that this one starts
-            from; empty for random ones.
+        after: Variant that trains the initial networks, with the same task and seed; empty if none.
         tasks: Tasks of this variant; empty for all tasks of the study.
     """
 
@@ -103,7 +102,8 @@ class Study:
         seeds: Default number of seeds.
         starts: Networks that the runs of a task start from, by task. If the task that trains them
             is not selected, the networks are random.
-        ships: Whether the best actors are evaluated and copied, instead of comparing runs.
+        ships: Whether the study selects actors to ship, instead of comparing variants. The best
+            actor of each run is evaluated, and copied if it beats the shipped one.
     """
 
     name: str
@@ -218,7 +218,7 @@ class Job:
 
     @property
     def is_trained(self) -> bool:
-        """True if the training state, which may be older than the log, has all steps."""
+        """True if the last training state has all environment steps; the log may be newer."""
         if not self.has_checkpoint:
             return False
         return read_counters(self.folder / STATE_FILE).env_steps >= self.config.total_steps
@@ -241,10 +241,9 @@ class Job:
         return f'{self.name}: {steps:,.0f} of {total:,} steps, eval {success}, ETA {left}'
 
     def check_configuration(self) -> None:
-        """Check that the folder contains no run with another configuration.
+        """Raise ValueError if the folder contains a run with another configuration.
 
-        Raises:
-            ValueError: If it does; the message names the fields that differ.
+        The message names the fields that differ. A damaged training state also raises ValueError.
         """
         if not self.has_checkpoint:
             return

@@ -1,4 +1,4 @@
-"""Run jobs in this process, in several processes or on Ray, each after the job it starts from."""
+"""Run jobs in this process, several processes or Ray; jobs wait for networks they start from."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def run_jobs(
     report: Path,
     when_finished: Callable[[], object],
 ) -> int:
-    """Run all unfinished jobs, each after the job it starts from.
+    """Run all unfinished jobs; a job that starts from networks of another one runs after it.
 
     Args:
         jobs: All jobs, the most important first.
@@ -110,9 +110,9 @@ def _print(text: str) -> None:
 
 
 def attempt(job: Job, report: Path, command: str) -> int:
-    """Train or continue a job, measure it, store the measures and return the exit status.
+    """Train or continue a job; store its measures and `command` in `report`; return a status.
 
-    The status is `TAKEN` if another process trains the job, or 128 + number of a stop signal.
+    The status is 0, 1 (error), `TAKEN` (another process trains it) or 128 + number of a signal.
     """
     try:
         # Another process may have finished the job meanwhile.
@@ -161,8 +161,8 @@ class ThisProcess:
 class Processes:
     """Place that runs several jobs at once, each in a process that prints to its `log.txt`.
 
-    Ctrl-C and SIGTERM are passed on to the processes as SIGTERM. They then finish their cycle and
-    save their state, as they do if this process is killed. A second signal ends them at once.
+    Ctrl-C and SIGTERM are passed on to the processes as SIGTERM. The processes then finish their
+    cycle and save their state, also if this process is killed. A second signal ends them at once.
     """
 
     def __init__(self, limit: int, report: Path, command: str) -> None:
@@ -228,7 +228,7 @@ class Processes:
 
 
 def _work(job: Job, report: Path, command: str) -> None:
-    """Train and measure one job, in one of the processes of `Processes`."""
+    """Call `attempt` in a process of `Processes`, print to `log.txt`, and exit with the status."""
     # In the group of the parent, Ctrl-C would arrive twice. The session stays the same: Linux
     # schedules by session, so `nice` would have no effect in another.
     os.setpgid(0, 0)
