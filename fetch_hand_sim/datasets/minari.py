@@ -48,8 +48,8 @@ def export_minari(by_task: ByTask, directory: Path, name: str) -> dict[str, str]
     """Write one Minari dataset for each task.
 
     Args:
-        by_task: Episodes by task, at least one each. Those of one task have the same control rate,
-            timing, reward type and success rule.
+        by_task: Episodes by task, at least one each. Episodes of one task have the same control
+            rate, timing, reward type and success rule.
         directory: Folder of the Minari datasets (`MINARI_DATASETS_PATH`).
         name: Name such as `logged-v0` or `me/logged-v0`; the task comes before it.
 

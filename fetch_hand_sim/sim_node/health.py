@@ -218,7 +218,7 @@ class Health:
             'seed': str(robot.runner.seed),
             'episodes finished': str(counters.episodes),
             'episodes successful': str(counters.successes),
-            'episodes given up': str(counters.given_up),
+            'episodes ended early': str(counters.ended_early),
             PERTURB_LIMIT: f'{robot.perturb_limit:g}',
             'divergences': str(robot.runner.simulation.divergences),
             'log': self._log(),

@@ -41,7 +41,7 @@ class Counters:
 
     Attributes:
         ticks: Published ticks, resets included.
-        given_up: Episodes that a reset ended early.
+        ended_early: Episodes that a reset ended early.
         late_commands: Steps in real time without the command that answers the last tick.
         tick_time: Wall-clock time of ticks: physics, encoding, publishing and logging.
     """
@@ -49,7 +49,7 @@ class Counters:
     ticks: int = 0
     episodes: int = 0
     successes: int = 0
-    given_up: int = 0
+    ended_early: int = 0
     late_commands: int = 0
     goals_set: int = 0
     goals_rejected: int = 0
@@ -209,7 +209,7 @@ class Robot:
         episode, was_running = runner.episode, not runner.is_between_episodes
         if was_running:
             runner.end_episode()
-            self.counters.given_up += 1
+            self.counters.ended_early += 1
         if to_first_episode:
             runner.start_over()
         ends = f'episode {episode} ends' if was_running else 'no episode is running'

@@ -169,9 +169,9 @@ class RunFolder:
         """
         self._last_checkpoint = time.monotonic()
         if with_replay:
-            self._last_replay = self._last_checkpoint
             kept = self.workers.share(self.config.kept_transitions)
             save_replay(self.replay_file(), experience.replay, kept)
+            self._last_replay = self._last_checkpoint
         if self.workers.is_first:
             self.save_actor(LATEST_FILE, learner.evaluation_actor(), counters.env_steps)
             extra = {'config': to_flat(self.config), 'command': self.command}

@@ -89,7 +89,7 @@ def actors_table(actors: Path) -> str:
         ValueError: If a file is no evaluation of an actor; the message names the file.
     """
     head = (
-        '| task | success (95 % interval) | at most | in Gymnasium-Robotics | touched once '
+        '| task | success (95 % interval) | at most | in Gymnasium-Robotics | at any step '
         '| mean return | episodes | env steps | best published (how read; who, steps) |'
     )
     return _table(head, actors, _row)

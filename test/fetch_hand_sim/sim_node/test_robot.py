@@ -62,7 +62,7 @@ def test_a_running_robot_answers_and_resets_at_the_next_tick(make):
     assert case.robot.reset().message == first_ends + end
     case.robot.tick()
     assert (case.place, case.last.status.phase) == ((1, 0), 'reset')
-    assert case.robot.counters.given_up == 1
+    assert case.robot.counters.ended_early == 1
     case = make('lockstep', episodes=1)
     case.robot.tick()
     assert case.robot.reset().message == 'episode 0 ends; it was the last'
