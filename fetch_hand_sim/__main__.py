@@ -99,7 +99,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _explain(words: Sequence[str]) -> int:
-    """Let argparse print help, version, completion script or an error for `words`, and exit."""
+    """Parse `words` so that argparse prints help, version, completion or an error, and exits."""
     try:
         make_parser().parse_args(words)
         return EXIT_USAGE
@@ -109,7 +109,7 @@ def _explain(words: Sequence[str]) -> int:
 
 
 def _split(words: Sequence[str]) -> tuple[Command | None, list[str], list[str]]:
-    """Return the subcommand or None, the words of its name, and the arguments after them."""
+    """Return the subcommand (None if unknown), the words of its name, and its arguments."""
     commands, command, path = COMMANDS, None, []
     for word in words:
         if word not in commands:
@@ -124,7 +124,7 @@ def ros_arguments(words: Sequence[str]) -> list[str]:
     """Expand short ROS parameters: `task:=FetchPush` becomes `--ros-args -p task:=FetchPush`.
 
     Words that begin with `__`, such as `__ns:=/left`, become remappings (`-r`). Other ROS arguments
-    may follow, with or without `--ros-args`.
+    may follow, with or without `--ros-args`. Without `:=` in each earlier word, nothing changes.
     """
     short = list(itertools.takewhile(lambda word: not word.startswith('-'), words))
     rest = list(words[len(short) :])
@@ -135,7 +135,7 @@ def ros_arguments(words: Sequence[str]) -> list[str]:
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """Return a parser of the subcommand names; it only prints help, errors and completion."""
+    """Return the parser for help, version, completion scripts and unknown subcommands."""
     parser = _Parser(prog=_NAME, description=__doc__)
     parser.add_argument('--version', action='version', version=f'{_NAME} {version(_NAME)}')
     shtab.add_argument_to(parser, help='print a script that completes commands in your shell')
@@ -147,7 +147,7 @@ class _Parser(CommandParser):
     """A parser that suggests a similar name for an unknown subcommand."""
 
     def error(self, message: str) -> NoReturn:
-        """Print the error in one line and exit."""
+        """Print the error in one line and exit with code 2."""
         if "invalid choice: '" in message:
             given = message.split("invalid choice: '")[1].split("'")[0]
             command = _split(self.prog.split()[1:])[0]

@@ -54,8 +54,8 @@ def build_message(topic: TopicSpec, stamp: int, values: ArrayLike) -> Any:
 def decode(topic: TopicSpec, message: Any) -> Array:
     """Return the vector (topic.size,) of a message of rclpy or of `schemas`.
 
-    Joints may have any order in the message; values of missing joints are NaN. A message with
-    another number of values raises ValueError.
+    A JointState may list its joints in any order; missing joints get NaN. Raise ValueError if
+    a number of values or poses is wrong, or if a MultiDOFJointState has other joints.
     """
     return checked_size(topic, _CODECS[topic.type_name][1](topic, message))
 
@@ -83,17 +83,17 @@ def build_status(
 
 
 def decode_status(message: Any) -> dict[str, str]:
-    """Return the key/value pairs of a DiagnosticArray; of equal keys, the last one counts."""
+    """Return the pairs of all statuses of a DiagnosticArray; of equal keys, the last one counts."""
     return {pair.key: pair.value for status in message.status for pair in status.values}
 
 
 def answer_label(stamp: int) -> str:
-    """Return the label in a command's `layout` that names the observation with this stamp."""
+    """Return the label for the MultiArrayLayout of a command that answers observation `stamp`."""
     return f'answers {stamp:019d}'
 
 
 def answered_stamp(message: Any) -> int | None:
-    """Return the stamp (ns) of the observation that a command names; None if it names none."""
+    """Return the stamp, ns, of the observation that a command answers; None without a label."""
     for dimension in message.layout.dim[1:2]:
         if found := _ANSWER_LABEL.fullmatch(dimension.label):
             return int(found[1])
@@ -136,7 +136,7 @@ _FIELDS = {
 
 
 def _build_geometry(name: str, values: Iterator[float]) -> Any:
-    """Return a geometry_msgs message of type `name`; take its numbers from the iterator."""
+    """Return a geometry_msgs message of type `name`, filled with the next numbers of `values`."""
     if name in _FIELDS:
         parts = {field: _build_geometry(kind, values) for field, kind in _FIELDS[name].items()}
     else:
@@ -149,7 +149,7 @@ def _geometry(name: str, values: ArrayLike) -> Any:
 
 
 def _read_geometry(name: str, message: Any) -> list[float]:
-    """Return the numbers of a geometry_msgs message of type `name`."""
+    """Return the numbers of a geometry_msgs message of type `name`, quaternions as wxyz."""
     if name not in _FIELDS:
         return [getattr(message, letter) for letter in _letters(name)]
     parts = (_read_geometry(kind, getattr(message, each)) for each, kind in _FIELDS[name].items())
@@ -284,9 +284,9 @@ class LayoutError(ValueError):
 class TopicCodec:
     """Encodes and decodes the vectors of one topic, except those of type DiagnosticArray.
 
-    Stamps are nanoseconds; types without a stamp have 0. If `requires_frame`, `decode` rejects a
-    `frame_id` that is neither empty nor that of the topic. `size` is the length of encoded
-    messages, bytes.
+    Stamps are nanoseconds, 0 for types without a stamp. With `requires_frame`, `decode` rejects a
+    `frame_id` that is neither empty nor that of the topic. `size` is the number of bytes of a
+    message that `encode` returns.
     """
 
     def __init__(self, topic: TopicSpec, *, requires_frame: bool = False) -> None:
@@ -335,7 +335,8 @@ class TopicCodec:
     def decode_many(self, messages: NDArray[np.uint8]) -> tuple[NDArray[np.int64], Array]:
         """Decode n messages (n, size) at once; return stamps (n,) and vectors (n, topic.size).
 
-        Messages that this project did not encode may raise LayoutError; decode these with `decode`.
+        Raise LayoutError if the bytes of any message are arranged differently from `encode`. In
+        this case, decode all messages one by one with `decode`.
         """
         if messages.ndim != 2 or messages.shape[1] != self.size:
             raise LayoutError(f'{self.topic.name}: {messages.shape[-1]} bytes, not {self.size}')
@@ -352,7 +353,7 @@ class TopicCodec:
         return stamps, np.take(floats, self._slots, axis=1).astype(np.float64, copy=False)
 
     def _fixed_runs(self) -> list[slice]:
-        """Return the ranges of bytes that are equal in all messages of the topic."""
+        """Return the byte ranges that are equal in all messages that `encode` returns."""
         varying = [(_BODY + _FLOAT.size * int(slot), _FLOAT.size) for slot in self._slots]
         if self._has_stamp:
             varying.append((_BODY, _STAMP.size))
@@ -366,7 +367,7 @@ class TopicCodec:
         return runs
 
     def _slot(self, marker: float) -> int:
-        """Return the index of the number `marker` among the float64s of the template message."""
+        """Return the index, in float64s, at which the template message contains `marker`."""
         pattern = _FLOAT.pack(marker)
         offset = self._template.find(pattern) - _BODY
         if self._template.count(pattern) != 1 or offset % _FLOAT.size:
@@ -377,8 +378,8 @@ class TopicCodec:
 class CommandCodec:
     """Encodes commands that name the observation they answer.
 
-    The layout of a command has a second dimension of size 1; its label contains the stamp of the
-    observation. Receivers that read only `data` may ignore it.
+    The MultiArrayLayout of a command has a second dimension of size 1, whose label contains the
+    stamp of the observation. Receivers may ignore it.
     """
 
     def __init__(self, topic: TopicSpec) -> None:

@@ -29,9 +29,10 @@ class Kind:
     """Limits and meaning of a field of a disturbance.
 
     Attributes:
-        off: The value that switches the disturbance off.
-        is_range: Whether a value is a pair (lowest, highest), from which each episode draws a
-            number. A single number n then means (n, n).
+        off: The value that switches the disturbance off; `lowest` ... `highest` are allowed.
+        is_range: Whether a value is a pair (low, high), from which each episode draws a number. A
+            single number n then means (n, n).
+        is_whole: Whether the number is whole, such as a delay in ticks.
         is_factor: Whether the number is a factor, which is scaled and drawn on a log scale.
     """
 
@@ -43,7 +44,7 @@ class Kind:
     is_factor: bool = False
 
     def checked(self, name: str, value: Any) -> Any:
-        """Return a value as a number or, for ranges, a pair; raise ValueError if not allowed."""
+        """Return the field `name` as a number or, for ranges, a pair; ValueError if not allowed."""
         given = list(value) if self.is_range and isinstance(value, (list, tuple)) else [value]
         is_right = len(given) in (1, 1 + self.is_range) and all(
             isinstance(each, (int, float))
@@ -62,7 +63,10 @@ class Kind:
         return (numbers[0], numbers[-1]) if self.is_range else numbers[0]
 
     def scaled(self, value: Any, strength: float) -> Any:
-        """Return `off + strength * (value - off)`, for factors `value ** strength`, clipped."""
+        """Return a number, or each of a pair, scaled by `strength` and clipped to the limits.
+
+        A factor becomes `value ** strength`, another number `off + strength * (value - off)`.
+        """
         if isinstance(value, tuple):
             return tuple(self.scaled(each, strength) for each in value)
         change = strength * (value - self.off)
@@ -70,7 +74,7 @@ class Kind:
         return min(max(value**strength if self.is_factor else moved, self.lowest), self.highest)
 
     def drawn(self, span: Span, share: float) -> float:
-        """Return the number at position `share`, 0 <= share < 1, between the limits `span`."""
+        """Return the number at `share`, 0 <= share < 1, of `span`; factors use a log scale."""
         lowest, highest = span
         if self.is_whole:
             return float(lowest + int(share * (highest - lowest + 1)))
@@ -88,14 +92,14 @@ SHIFT = Kind(0.0, -1.0, 1.0)
 
 
 def _off(kind: Kind) -> Any:
-    """Return a dataclass field whose default switches the disturbance off."""
+    """Return a dataclass field with the limits `kind`; its default is the off value."""
     default = (kind.off, kind.off) if kind.is_range else kind.off
     return field(default=default, metadata={'kind': kind})
 
 
 @dataclass(frozen=True)
 class _Group:
-    """Base class of groups such as `PushDisturbance`; checks fields, turns ranges n into (n, n)."""
+    """Base class of groups such as `PushDisturbance`; `Kind.checked` converts each field."""
 
     def __post_init__(self) -> None:
         for each in fields(self):
@@ -178,7 +182,7 @@ class PhysicsDisturbance(_Group):
         gain: Factor of the gain of the position actuators (hand, gripper fingers).
         force_limit: Factor of the largest actuator force (hand).
         damping: Factor of the damping of the driven joints (hand).
-        gravity_tilt: Angle between gravity and the vertical, rad; its direction is random.
+        gravity_tilt: Largest angle between gravity and the vertical, rad; its direction is random.
         table_height: Shift of the table and of the object on it, m (Fetch).
     """
 
@@ -197,7 +201,7 @@ class PushDisturbance(_Group):
     """Random pushes of one tick; they act on the object, or without one on gripper or palm.
 
     Attributes:
-        force: Standard deviation per axis, as a share of the weight of the pushed body.
+        force: Standard deviation of the force per axis, as a share of the pushed body's weight.
         rate: Mean number of pushes per simulated second.
     """
 
@@ -235,10 +239,10 @@ class Disturbances:
         return self == Disturbances()
 
     def scaled(self, factor: float) -> Disturbances:
-        """Return the disturbances `factor` times as strong.
+        """Return the disturbances `factor` times as strong, within the limits of each value.
 
-        Sizes, probabilities and delays are multiplied by `factor`; delays are then rounded. Values
-        that are factors are raised to the power of `factor`: 0.5 scaled by 2 is 0.25.
+        The difference of a value from its off value is multiplied by `factor`; ticks are rounded.
+        Values that are factors are raised to the power of `factor`: 0.5 scaled by 2 is 0.25.
         """
         groups = {}
         for group in fields(self):
@@ -251,7 +255,7 @@ class Disturbances:
         return dataclasses.replace(self, **groups)
 
     def as_dict(self) -> dict[str, dict[str, Any]]:
-        """Return the values that are not off, for JSON or YAML; `from_dict` reads the result."""
+        """Return the values that are not off, by group and field; `from_dict` reads the result."""
         found: dict[str, dict[str, Any]] = {}
         for group in fields(self):
             for each in fields(getattr(self, group.name)):
@@ -267,7 +271,7 @@ class Disturbances:
 
     @classmethod
     def from_json(cls, text: str) -> Disturbances:
-        """Return the disturbances of a JSON text from `to_json`, or raise ValueError."""
+        """Return the disturbances of a JSON text from `to_json`; ValueError if it is invalid."""
         try:
             return cls.from_dict(json.loads(text))
         except RecursionError:
@@ -275,7 +279,7 @@ class Disturbances:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Disturbances:
-        """Return the disturbances of a mapping from `as_dict`, or raise ValueError."""
+        """Return the disturbances of a mapping from `as_dict`; ValueError if it is invalid."""
         groups: dict[str, Any] = {each.name: type(each.default) for each in fields(cls)}
         found: dict[str, Any] = {}
         for name, given in entries('disturbances', values, list(groups)).items():

@@ -46,9 +46,9 @@ def observation(task: TaskSpec, readings: Readings, tick_duration: float) -> Arr
 
 
 def _fetch_parts(task: TaskSpec, readings: Readings, tick_duration: float) -> list[Array]:
-    """Return the observation parts of a Fetch task, in the order of `fetch_env.py`.
+    """Return the observation parts of a Fetch task in the order of Gymnasium-Robotics.
 
-    Velocities are per tick: values per second are multiplied by `tick_duration`.
+    Velocities are m or rad per tick: values per second are multiplied by `tick_duration`, s.
     """
     count, joints = len(task.robot.joints), readings['joint_states']
     fingers = joints[..., count - 2 : count]
@@ -80,7 +80,7 @@ def _fingertip_positions(readings: Readings) -> Array:
 
 
 def achieved_goal(task: TaskSpec, readings: Readings) -> Array:
-    """Return achieved goals (..., task.goal.size) in a new array."""
+    """Return achieved goals (..., task.goal.size), m and quaternion wxyz, in a new array."""
     if task.formulas is not None:
         return task.formulas.achieved_goal(readings)
     if task.goal is GoalKind.FINGERTIPS:

@@ -33,7 +33,7 @@ class ParameterSpec:
         longest: Maximum number of characters; None for no limit.
         or_zero: Whether 0 is allowed, too, although it is less than `lower`.
         read_only: Whether the value cannot change while the node runs.
-        check: Raises ValueError for invalid values within type and limits.
+        check: Raises ValueError for an invalid value; None as its result also rejects a string.
         former: Former name of the parameter, which is accepted with a warning.
         is_path: Whether the node replaces `~` by the home directory, because no shell does this in
             `<name>:=<value>`.

@@ -63,11 +63,11 @@ class RobotSpec:
 
     @property
     def has_normalised_command(self) -> bool:
-        """True if commands equal actions in [-1, 1]."""
+        """True if all limits of the command are -1 and 1, so that commands equal actions."""
         return all(part.lower == -1.0 and part.upper == 1.0 for part in self.command)
 
     def with_joint_prefix(self, prefix: str) -> RobotSpec:
-        """Return a copy whose joint names begin with `prefix`, such as `rh_`, not `robot0:`."""
+        """Return a copy with `prefix`, such as `rh_`, in place of `robot0:` in the joint names."""
 
         def renamed(name: str) -> str:
             is_joint = name.startswith(JOINT_PREFIX)
@@ -79,7 +79,7 @@ class RobotSpec:
 
 
 def read_joint_prefix(robot: RobotSpec, prefix: str) -> str:
-    """Return the joint prefix for the value `prefix` of the parameter `joint_prefix`.
+    """Return the prefix of joint names for the value `prefix` of the parameter `joint_prefix`.
 
     `model` gives `robot0:`. Other values are returned as they are, or raise ValueError if no joint
     of the robot begins with `robot0:`.
@@ -179,8 +179,7 @@ def command_from_action(robot: RobotSpec, action: ArrayLike) -> NDArray[Any]:
     """Map actions (..., action_size), clipped to [-1, 1], to commands of the same shape.
 
     For Fetch, the command equals the action and keeps its floating type, because Gymnasium-Robotics
-    scales it in that type. For other robots, -1 and 1 map to the limits of the command, as in
-    `hand_env.py`.
+    scales it in that type. For other robots, -1 and 1 map to the limits of the command.
     """
     clipped = np.asarray(np.clip(np.asarray(action), -1.0, 1.0))
     if robot.has_normalised_command:
@@ -191,7 +190,7 @@ def command_from_action(robot: RobotSpec, action: ArrayLike) -> NDArray[Any]:
 
 
 def action_from_command(robot: RobotSpec, command: ArrayLike) -> Array:
-    """Map commands (..., action_size) to actions, clipped to [-1, 1]."""
+    """Map commands (..., action_size) to actions, clipped to [-1, 1], of the same shape."""
     values = np.asarray(command, dtype=np.float64)
     if not robot.has_normalised_command:
         lower, upper = command_limits(robot)

@@ -41,13 +41,13 @@ def quaternion_multiply(first: ArrayLike, second: ArrayLike) -> Array:
 
 
 def quaternion_conjugate(quaternion: ArrayLike) -> Array:
-    """Return the inverse of unit quaternions wxyz, (..., 4)."""
+    """Return the conjugate of quaternions wxyz (..., 4), the inverse of unit quaternions."""
     values = np.asarray(quaternion, dtype=np.float64)
     return np.asarray(values * np.array([1.0, -1.0, -1.0, -1.0]))
 
 
 def quaternion_from_axis_angle(axis: ArrayLike, angle: ArrayLike) -> Array:
-    """Return unit quaternions wxyz of axes (..., 3) of any length and angles (...), rad."""
+    """Return unit quaternions wxyz of axes (..., 3), of any length but 0, and angles (...), rad."""
     direction = np.array(axis, dtype=np.float64)
     direction = direction / _length(direction)
     half = np.asarray(angle, dtype=np.float64)[..., None] / 2.0
@@ -96,7 +96,7 @@ def matrix_to_euler(matrix: ArrayLike) -> Array:
 
 
 def euler_to_quaternion(euler: ArrayLike) -> Array:
-    """Return quaternions qx qy qz, wxyz (..., 4), of intrinsic Euler angles xyz (..., 3), rad."""
+    """Return unit quaternions wxyz (..., 4) of intrinsic Euler angles xyz (..., 3), rad."""
     x, y, z = _parts(euler)
     ai, aj, ak = z / 2, -y / 2, x / 2
     si, sj, sk = np.sin(ai), np.sin(aj), np.sin(ak)
@@ -129,8 +129,8 @@ def quaternion_to_euler(quaternion: ArrayLike) -> Array:
 def rotation_angle(first: ArrayLike, second: ArrayLike, antipodal: bool) -> Array:
     """Return the angles (...), rad, between unit quaternions wxyz (..., 4).
 
-    If `antipodal`, q and -q are equal and angles are in [0, pi]. Otherwise q and -q are 2 pi apart
-    and angles are in [0, 2 pi], as in Gymnasium-Robotics.
+    If `antipodal`, q and -q are the same rotation and angles are in [0, pi]. Otherwise q and -q are
+    2 pi apart and angles are in [0, 2 pi], as in Gymnasium-Robotics.
     """
     real = _parts(quaternion_multiply(first, quaternion_conjugate(second)))[0]
     return np.asarray(2.0 * np.arccos(np.clip(np.abs(real) if antipodal else real, -1.0, 1.0)))

@@ -38,14 +38,14 @@ def message_class(type_name: str) -> Any:
 
 @cache
 def schema_text(type_name: str) -> str:
-    """Return the definition of a type and its nested types in format `ros2msg`, for MCAP."""
+    """Return the `ros2msg` text of a type and its nested types, for MCAP, or raise ValueError."""
     message_class(type_name)
     return _store().generate_msgdef(type_name, ros_version=2)[0]
 
 
 @cache
 def type_hash(type_name: str) -> str:
-    """Return the type hash of REP 2016: `RIHS01_` and 64 hexadecimal digits."""
+    """Return the type hash of REP 2016 (`RIHS01_` and 64 hex digits), or raise ValueError."""
     message_class(type_name)
     return _store().hash_rihs01(type_name)
 

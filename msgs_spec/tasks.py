@@ -1,10 +1,10 @@
-"""The tasks as data: goals, observations, lengths, thresholds.
+"""The tasks as data, with their goals, observations, lengths and thresholds.
 
 Thirteen tasks come from Plappert et al. 2018. Other packages may add a task by two entry points
-with the name of the task. The one in group `fetch_hand_sim_tasks.specification` refers to a
-`TaskSpec`, in a module that does not import MuJoCo. The one in group
-`fetch_hand_sim_tasks.simulation` refers to the class that simulates the task. Invalid tasks are
-left out with a warning; `fetch_hand_sim.simulation.check_task` finds subtle mistakes.
+with the name of the task. The entry point in group `fetch_hand_sim_tasks.specification` names a
+`TaskSpec`, in a module that does not import MuJoCo. The entry point in group
+`fetch_hand_sim_tasks.simulation` names the class that simulates the task. Invalid tasks are left
+out with a warning; `fetch_hand_sim.simulation.check_task` finds subtle mistakes.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ class TaskSpec:
 
     Attributes:
         observation: Parts of the observation vector, in order.
-        episode_ticks: Steps per episode; in `TASKS` those at 25 Hz.
+        episode_ticks: Steps per episode; `TASKS` contains the number at 25 Hz.
         object_name: `object0` (Fetch), `object` (hand), or None for tasks without an object.
         distance_threshold: Success threshold of the distance, m.
         rotation_threshold: Success threshold of the rotation, rad; None for goals without rotation.
@@ -97,8 +97,8 @@ class TaskSpec:
         achieved_goal: Name of the observation part that is the achieved goal.
         position_counts: Whether the position of a pose goal counts (False for the Rotate tasks).
         ignores_z_rotation: Whether the rotation about the object's own z axis does not count (pen).
-        object_symmetry: `cube`, or `revolution` for an object that looks the same when turned about
-            its z axis or upside down; None unless goals are poses.
+        object_symmetry: `cube` if the object looks the same on each face; `revolution` if it does
+            when turned about its z axis or upside down; None unless goals are poses.
         formulas: Formulas of a third-party task; None if its observation is that of one of the
             thirteen tasks.
         looks_like: Name of one of the thirteen tasks, whose camera view and goal region this task
@@ -346,7 +346,7 @@ def third_party_tasks() -> dict[str, TaskSpec]:
 
 
 def _accept(name: str, spec: Any) -> TaskSpec:
-    """Return a third-party specification; raise ValueError if it is invalid."""
+    """Return `spec` without `reference_id`; raise an error if it is no valid task called `name`."""
     if not isinstance(spec, TaskSpec):
         raise ValueError(f'{type(spec).__name__} given; allowed: a TaskSpec')
     if spec.name != name:
@@ -360,7 +360,7 @@ def _accept(name: str, spec: Any) -> TaskSpec:
 
 
 def third_party_simulation(name: str) -> Any:
-    """Return the class that simulates a third-party task, or raise ValueError."""
+    """Return the class that simulates a third-party task; ValueError if missing or broken."""
     found = entry_points(group=SIMULATIONS, name=name)
     # Several packages may use the name: prefer the package of the specification.
     own = [each for each in found if _package(each) == _PACKAGES.get(name)]

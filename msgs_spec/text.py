@@ -23,7 +23,10 @@ def did_you_mean(given: str, allowed: Iterable[str] | Mapping[str, str]) -> str:
 
 
 def one_of(given: object, allowed: Sequence[Name], meaning: str) -> Name:
-    """Return `given` if it is in `allowed`; else raise ValueError `<meaning> ...; allowed: ...`."""
+    """Return the name in `allowed` that equals `given`; otherwise raise ValueError.
+
+    The error is `<meaning> '<given>'; allowed: <names>`, for example `task 'x'; allowed: a, b`.
+    """
     for name in allowed:
         if given == name:
             return name
@@ -35,7 +38,7 @@ def one_of(given: object, allowed: Sequence[Name], meaning: str) -> Name:
 def entries(owner: str, values: Any, allowed: Sequence[str]) -> dict[str, Any]:
     """Return the mapping `values` as a dictionary, if all its keys are in `allowed`.
 
-    Otherwise, or for another type, raise ValueError; the message calls the mapping `owner`.
+    For other keys or another type, raise ValueError; its text begins with the name `owner`.
     """
     if not isinstance(values, Mapping):
         raise ValueError(
@@ -52,14 +55,14 @@ def first_of(names: Sequence[str], most: int) -> str:
 
 
 def printable(text: str) -> str:
-    """Return a text whose control characters, which a terminal would interpret, are escaped."""
+    """Return a text with unprintable characters, such as line breaks, as escape sequences."""
     return ''.join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
 
 
 def one_line(text: object, longest: int = 200) -> str:
-    """Return a text or an error as one safe line of at most `longest` characters.
+    """Return a text or an error as one printable line, cut after `longest` characters.
 
-    An error without a message becomes the name of its type.
+    Line breaks become spaces. An error without a message becomes the name of its type.
     """
     words = ' '.join(str(text).split())
     if not words and isinstance(text, BaseException):

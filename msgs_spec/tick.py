@@ -135,7 +135,7 @@ class Tick:
 
     Attributes:
         stamp_ns: Simulated time, nanoseconds.
-        readings: Sensor readings, (topic.size,) for each topic.
+        readings: Sensor values (topic.size,) by topic name.
         desired_goal: (goal size,).
         achieved_goal: (goal size,).
         applied_command: (action size,), command units, after clipping.
@@ -202,12 +202,12 @@ class TickEncoder:
         return messages
 
     def encode_clock(self, stamp_ns: int) -> tuple[TopicSpec, bytes]:
-        """Return the topic and the message `/clock`, for a paused simulation."""
+        """Return the topic `/clock` and its message (CDR bytes), for a paused simulation."""
         clock = self._codecs[0]
         return clock.topic, clock.encode(stamp_ns, [])
 
     def encode_status(self, stamp_ns: int, status: EpisodeStatus) -> tuple[TopicSpec, bytes]:
-        """Return the topic and the message `episode_status`."""
+        """Return the topic `episode_status` and its message (CDR bytes)."""
         message = build_status(self._status, stamp_ns, 'episode', status.to_values())
         return self._status, serialize(self._status.type_name, message)
 
@@ -215,8 +215,8 @@ class TickEncoder:
 def join_messages(messages: Sequence[tuple[TopicSpec, bytes]]) -> bytes:
     """Join the messages of a tick to one message of `latest_tick`; return its CDR bytes.
 
-    `data` contains the CDR bytes of the messages in order. `layout` has a dimension for each of
-    them: the label is the name of the topic, size and stride are the number of bytes.
+    The field `data` contains the CDR bytes of the messages in order. The field `layout` has a
+    dimension for each message, with the topic name as label and the bytes as size and stride.
     """
     dimension, layout = (
         message_class(f'std_msgs/msg/MultiArray{part}') for part in ('Dimension', 'Layout')
@@ -230,7 +230,7 @@ def join_messages(messages: Sequence[tuple[TopicSpec, bytes]]) -> bytes:
 
 
 def split_messages(data: bytes) -> dict[str, bytes]:
-    """Split a `latest_tick` into the CDR bytes of each topic, in order, or raise ValueError."""
+    """Return the CDR bytes of each topic in a `latest_tick`; ValueError if sizes are wrong."""
     message = deserialize(LATEST_TICK.type_name, data)
     rest, parts = bytes(message.data), {}
     for part in message.layout.dim:

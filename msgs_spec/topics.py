@@ -14,7 +14,7 @@ from msgs_spec.text import one_of
 
 @dataclass(frozen=True, slots=True)
 class QosSpec:
-    """Quality of service. If `transient_local`, late subscribers get the last `depth` messages."""
+    """Quality of service; if `transient_local`, late subscribers get the last `depth` messages."""
 
     depth: int
     reliability: Literal['reliable', 'best_effort']
@@ -64,11 +64,11 @@ class TopicSpec:
 
     Attributes:
         name: Name relative to the namespace of the node; `/clock` is absolute.
-        layout: Parts of the float64 vector of the message. Quaternions are wxyz in the vector and
-            xyzw in the message.
+        layout: Parts of the float64 vector that the message is converted to; () if it has none.
+            Quaternions are wxyz in the vector and xyzw in the message.
         frame: `header.frame_id` of the message; empty if it has none.
         names: Joint names in the message; empty for types without joints.
-        direction: Whether `sim_node` publishes the topic or subscribes to it.
+        direction: `subscribed` if `sim_node` subscribes to the topic, else `published`.
         since: First `INTERFACE_VERSION` whose episode files contain the topic.
     """
 
@@ -89,7 +89,7 @@ class TopicSpec:
 
     @property
     def unit(self) -> str:
-        """The different units of the parts as text, in order."""
+        """The units of the parts without repetitions, such as `m, quaternion`."""
         return ', '.join(dict.fromkeys(part.unit for part in self.layout if part.unit))
 
 
@@ -245,7 +245,7 @@ GROUND_TRUTH = 'ground_truth'
 
 
 def ground_truth_topics(task: TaskSpec) -> tuple[TopicSpec, ...]:
-    """Return the additional topics of a disturbed robot, which publish its true state."""
+    """Return the `ground_truth/` topics, the undisturbed sensor values of a disturbed robot."""
     return tuple(
         replace(
             spec,
@@ -265,7 +265,7 @@ def relative_name(resolved: str) -> str:
 
 @lru_cache(maxsize=_TASKS)
 def topics(task: TaskSpec) -> tuple[TopicSpec, ...]:
-    """Return all topics of a task.
+    """Return the topics of `sim_node` for a task, without `ground_truth_topics` and `MONITORING`.
 
     The order is part of the contract. Published topics come first, in the order of publication:
     `applied_command` is the last topic of a step, and `episode_status` follows at some ticks.
@@ -288,7 +288,7 @@ def topics(task: TaskSpec) -> tuple[TopicSpec, ...]:
 
 
 def topic(task: TaskSpec, name: str) -> TopicSpec:
-    """Return a topic of a task by name; raise ValueError, which lists all names, if missing."""
+    """Return the one of `topics` with this name; ValueError, which lists all names, if missing."""
     found = {spec.name: spec for spec in topics(task)}
     return found[one_of(name, list(found), f'{task.name} has no topic')]
 
@@ -333,7 +333,7 @@ def _scalar(name: str, unit: str, text: str) -> TopicSpec:
 
 @lru_cache(maxsize=_TASKS)
 def scalar_topics(task: TaskSpec) -> tuple[TopicSpec, ...]:
-    """Return the topics of a task for plots: distance, rotation, reward and is_success.
+    """Return the `scalars/` topics, for plots of distance, rotation, reward and success.
 
     A task has `distance` and `rotation` only if they count for success. Stamps are those of ticks.
     """

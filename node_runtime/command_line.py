@@ -66,7 +66,7 @@ class UsageError(CommandError):
 def usage_errors(
     errors: type[Exception] | tuple[type[Exception], ...] = ValueError, prefix: str = ''
 ) -> Iterator[None]:
-    """Convert `errors` raised in the `with` block to `UsageError`; `prefix` starts its message."""
+    """Convert `errors` in the `with` block to `UsageError`; put `prefix` before its message."""
     try:
         yield
     except errors as error:
@@ -77,7 +77,7 @@ class CommandParser(argparse.ArgumentParser):
     """An argument parser with one-line errors and suggestions for misspelt names."""
 
     def error(self, message: str) -> NoReturn:
-        """Print the error with a suggestion and exit with code 2."""
+        """Print the error, with a suggestion if a name seems misspelt, and exit with code 2."""
         complain(self.prog, f'{message}{self._hint(message)}')
         sys.exit(EXIT_USAGE)
 
@@ -147,7 +147,7 @@ def say(text: object) -> None:
 
 
 def given_command(name: str, arguments: Sequence[str] | None) -> str:
-    """Return a command line as one line, for metadata; `arguments` None means `sys.argv`."""
+    """Return `name` and `arguments` (None: those of `sys.argv`) as one line, quoted for a shell."""
     words = [*name.split(), *(sys.argv[1:] if arguments is None else arguments)]
     return printable(shlex.join(words))
 
@@ -212,7 +212,7 @@ def _ignores_interrupt() -> bool:
 
 
 def make_output_usable() -> None:
-    """Replace a missing stdout or stderr, and escape characters that their encoding lacks.
+    """Replace a missing stdout or stderr by /dev/null; escape characters that others lack.
 
     Does nothing in a program with its own SIGINT handler, which called the command as a function.
     """
@@ -230,7 +230,7 @@ def make_output_usable() -> None:
 def start_command(name: str, module: str, *extras: str) -> int:
     """Import `module`, which needs `extras` of this package, and return the result of its `main`.
 
-    The import takes seconds; `guard_loading` handles Ctrl-C meanwhile.
+    If an extra is missing, print what to install and return 2.
     """
     try:
         for extra in extras:
@@ -271,7 +271,7 @@ def _require_rclpy() -> None:
 
 @contextmanager
 def progress(description: str, total: int) -> Iterator[Callable[[int], None]]:
-    """Show a progress bar if stderr is a terminal; yield a function that adds to its count."""
+    """Show a progress bar up to `total` if stderr is a terminal; yield a function that adds to it."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
     from rich.progress import TimeRemainingColumn as Remaining

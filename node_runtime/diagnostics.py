@@ -33,9 +33,9 @@ _LATEST = (2**31 - 1) * 10**9
 
 
 def next_report(due: float, now: float) -> float:
-    """Return when the next report is due: a period after `due`, the time of the present one.
+    """Return the time of the next report: `REPORT_PERIOD` after `due`, that of the present report.
 
-    Times are seconds of a steady clock. If that time has passed, return a period after `now`.
+    Times are s of a steady clock. If that is not after `now`, return `now + REPORT_PERIOD`.
     """
     return due + REPORT_PERIOD if due + REPORT_PERIOD > now else now + REPORT_PERIOD
 
@@ -50,7 +50,7 @@ class Level(IntEnum):
 
 @dataclass(slots=True)
 class Report:
-    """One status of `/diagnostics`, with key/value pairs and problems."""
+    """One status of `/diagnostics`; `summary` is its message if there are no `problems`."""
 
     name: str
     hardware_id: str
@@ -68,12 +68,12 @@ class Report:
 
     @property
     def level(self) -> Level:
-        """Level of the worst problem."""
+        """Level of the worst problem; OK without problems."""
         return max((level for level, _ in self.problems), default=Level.OK)
 
     @property
     def message(self) -> str:
-        """All problems, the worst first; the summary if there are no problems."""
+        """All problems, the worst first, as one text; `summary` if there are no problems."""
         ranked = sorted(self.problems, key=lambda problem: -problem[0])
         return '; '.join(text for _, text in ranked) or self.summary
 
@@ -115,7 +115,7 @@ class Durations:
         return float(np.median(self._values)) if self._values else 0.0
 
     def milliseconds(self) -> dict[str, str]:
-        """Return median, 99th percentile and maximum as text, ms; `-` without durations."""
+        """Return `p50`, `p99` (percentiles) and `max` in ms as text; `-` without durations."""
         names = ('p50', 'p99', 'max')
         if not self._values:
             return dict.fromkeys(names, '-')
@@ -130,6 +130,6 @@ class Increase:
         self._before = 0.0
 
     def since(self, value: float) -> float:
-        """Return by how much the counter, now `value`, has grown since the last call."""
+        """Return how much the counter has grown since the last call; `value` is its value now."""
         grown, self._before = value - self._before, value
         return grown

@@ -45,8 +45,8 @@ class EventLoop:
     def serve_pending(self, limit: int) -> None:
         """Run the callbacks that are waiting now, at most `limit`.
 
-        Callbacks that arrive meanwhile do not run, except with SingleThreadedExecutor (at most 10
-        callbacks). A limit of time would make the result depend on the load of the machine.
+        Callbacks that arrive meanwhile do not run. SingleThreadedExecutor may run them, but at most
+        10 in all. With a limit in seconds, the result would depend on the load of the machine.
         """
         self._announce_after_suspension()
         if not self._is_queue:
@@ -69,8 +69,8 @@ class EventLoop:
     def _announce_after_suspension(self) -> None:
         """Publish the name of the node again after a suspension (SIGSTOP, or sleep of the machine).
 
-        Other processes have then removed this one; they find it again, but not the names of its
-        nodes. rmw sends the names whenever a node creates or destroys a publisher.
+        During a long suspension, other processes forget this process. Afterwards they find it, but
+        not its node names. rmw sends names whenever a node creates or destroys a publisher.
         """
         now = time.clock_gettime(_CLOCK)
         if now - self._called_at > _SUSPENDED:

@@ -87,7 +87,7 @@ class StopSignals:
     def watch(self) -> Callable[[], bool]:
         """Return a function that returns whether a signal arrived a second or more after this call.
 
-        Earlier signals do not count, because shells and supervisors may send several at once.
+        Signals before that do not count, because shells and supervisors may send several at once.
         """
         earliest = time.monotonic() + _AT_ONCE
         return lambda: self._received_at >= earliest
@@ -254,7 +254,10 @@ def _initialise(init: Callable[..., None], args: list[str] | None, handlers: Any
 
 
 def _reject_arguments(args: Sequence[str]) -> None:
-    """Raise UsageError for arguments outside `--ros-args`, empty parameters and invalid names."""
+    """Raise UsageError for an argument outside `--ros-args` or an invalid one inside.
+
+    A parameter without a value and a wrong node name or namespace are invalid.
+    """
     inside = False
     for before, arg in pairwise(['', *args]):
         if arg == '--ros-args':

@@ -36,9 +36,9 @@ _PATIENCE = 6.0
 
 
 def seldom(seconds: float) -> dict[str, Any]:
-    """Return logger arguments that print a line at most once in `seconds` of a steady clock.
+    """Return keyword arguments that limit a log call to once in `seconds` of a steady clock.
 
-    With the system clock, rclpy's default, no line would appear for long after it is set back.
+    With the system clock, rclpy's default, lines would be missing after that clock is set back.
     """
     return {'throttle_duration_sec': seconds, 'throttle_time_source_type': _steady_clock()}
 
@@ -103,7 +103,7 @@ def subscribe(
 def full_name(namespace: str, name: str) -> str:
     """Return the full name of a node in a namespace, such as `/left/sim_node`.
 
-    A node whose name discovery has not found yet gets a descriptive text instead.
+    While discovery does not know the name, the result is `(a node without a name yet)`.
     """
     if name == _UNKNOWN:
         return '(a node without a name yet)'
@@ -126,7 +126,7 @@ def await_acknowledgements(publishers: Iterable[Publisher]) -> None:
 
 
 class SubscriberWatch:
-    """Tracks whether all subscribers of some publishers are connected."""
+    """Tracks whether all discovered subscribers of the given publishers are connected."""
 
     def __init__(self, node: Node, publishers: Iterable[Publisher]) -> None:
         self._node = node
@@ -177,14 +177,15 @@ _UDP_ONLY = Path(__file__).with_name('fastdds_udp.xml')
 
 
 def keep_discovery_local(environment: MutableMapping[str, str] = os.environ) -> None:
-    """Restrict discovery to this machine unless the user chose a range."""
+    """Set `ROS_AUTOMATIC_DISCOVERY_RANGE` to `LOCALHOST`, this machine, unless it is set."""
     environment.setdefault(_RANGE, 'LOCALHOST')
 
 
 def leave_out_shared_memory(environment: MutableMapping[str, str] = os.environ) -> None:
-    """Make Fast DDS use UDP alone unless the user chose transports or another middleware.
+    """Set environment variables that make Fast DDS use UDP alone.
 
-    Call it before rclpy is initialised and after `keep_discovery_local`.
+    Do nothing if the user chose transports, peers, a profile or another middleware. Call it before
+    rclpy is initialised and after `keep_discovery_local`, whose variable it may replace.
     """
     middleware = environment.get('RMW_IMPLEMENTATION') or 'rmw_fastrtps_cpp'
     if not middleware.startswith('rmw_fastrtps') or any(map(environment.get, _DECISIONS)):

@@ -17,8 +17,9 @@ if TYPE_CHECKING:
 def declare_parameters(node: Node, specs: Sequence[ParameterSpec]) -> dict[str, Any]:
     """Declare parameters with description and range, and return their values by name.
 
-    This function also offers the parameter services; create the node with
-    `start_parameter_services=False`. Unknown parameters and former names are logged as warnings.
+    This function also offers the parameter services, so create the node with
+    `start_parameter_services=False`. It warns of unknown parameters and of former names, whose
+    values it uses. It raises ValueError if a given value is not allowed.
     """
     _serve_parameter_requests(node)
     # rclpy has no public access to given values before their declaration.
@@ -86,8 +87,8 @@ def set_callback(
 ) -> Callable[[list[Parameter]], SetParametersResult]:
     """Return a callback for `Node.add_on_set_parameters_callback` that checks new values.
 
-    Parameters that are not in `specs`, such as those of ROS, are accepted. With `makes_time`, for
-    the node that defines simulated time, `use_sim_time: true` is rejected.
+    Parameters that are not in `specs`, such as those of ROS, are accepted. Set `makes_time` for
+    the node that publishes simulated time; it then rejects `use_sim_time: true`.
     """
     from rcl_interfaces.msg import SetParametersResult
 
@@ -108,9 +109,9 @@ def set_callback(
 
 
 def _serve_parameter_requests(node: Node) -> None:
-    """Offer the parameter services, which reject parameters of an unknown type.
+    """Offer the parameter services, which reject values whose type number ROS does not define.
 
-    The services of rclpy would raise an exception for these, which ends the node.
+    The services of rclpy would raise an exception for such values, which ends the node.
     """
     from rcl_interfaces.srv import SetParameters
     from rclpy.parameter_service import ParameterService
@@ -139,7 +140,7 @@ def _serve_parameter_requests(node: Node) -> None:
 
 
 def _rejection(message: Any) -> SetParametersResult | None:
-    """Return the answer that rejects a parameter of an unknown type; None for known types."""
+    """Return the rejection of a `Parameter` message with an undefined type number, else None."""
     from rcl_interfaces.msg import SetParametersResult
     from rclpy.parameter import Parameter
 

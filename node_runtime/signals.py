@@ -55,7 +55,7 @@ def _command() -> str:
 
 
 class _ExitAtOnce:
-    """A signal handler that ends the process at once; imports may swallow KeyboardInterrupt."""
+    """A signal handler that exits with code 130, because imports may swallow KeyboardInterrupt."""
 
     def __init__(self, name: str) -> None:
         self._name = name
@@ -73,13 +73,13 @@ def on_stop_signals(
     stop: Callable[[int, FrameType | None], None],
     raises_again: bool = False,
 ) -> Iterator[list[int]]:
-    """Context manager that calls `stop` at the first signal of each kind; yields their numbers.
+    """Context manager that calls `stop` at the first signal of each kind.
 
-    A second signal of a kind ends the process. A second SIGHUP is ignored, because a closed
-    terminal sends two. The list of numbers grows as signals arrive.
+    It yields a list of the signal numbers received so far, which grows as signals arrive. A second
+    signal of a kind ends the process. A second SIGHUP is ignored, because a closed terminal sends
+    two. The end of the block restores the earlier handlers.
 
     Args:
-        numbers: Signals to handle.
         stop: Called with the signal number and the frame.
         raises_again: Whether a second SIGINT raises KeyboardInterrupt instead of ending the
             process. Set it in programs of users, such as notebooks.
@@ -106,7 +106,7 @@ def on_stop_signals(
 
 
 def available_signals(numbers: Iterable[signal.Signals]) -> list[signal.Signals]:
-    """Return the signals that this thread may handle: none outside of the main thread.
+    """Return those of `numbers` that this thread may handle; [] outside of the main thread.
 
     SIGHUP is excluded if the process ignores it, as under `nohup`.
     """
@@ -117,7 +117,7 @@ def available_signals(numbers: Iterable[signal.Signals]) -> list[signal.Signals]
 
 
 def discard_unread_output() -> None:
-    """Redirect stdout and stderr to /dev/null if their terminal or pipe is closed.
+    """Redirect each of stdout and stderr to /dev/null if its terminal or pipe is closed.
 
     Commands use it to continue after the process that reads their output has ended.
     """
@@ -127,7 +127,7 @@ def discard_unread_output() -> None:
 
 
 def is_unread(number: int) -> bool:
-    """Return whether the reading end of a file descriptor is closed."""
+    """Return whether the other end of a pipe or terminal, file descriptor `number`, is closed."""
     poll = select.poll()
     poll.register(number, 0)
     return any(events & (select.POLLHUP | select.POLLERR) for _, events in poll.poll(0))
@@ -141,9 +141,10 @@ def discard_output(number: int) -> None:
 
 
 def end_with_parent(parent: int) -> None:
-    """Make Linux send SIGTERM to this process when its parent, the process `parent`, ends.
+    """Make Linux send SIGTERM to this process when its parent, process id `parent`, ends.
 
-    Processes outside of the process group of the parent need it; Ctrl-C does not reach them.
+    If the parent has ended already, SIGTERM follows at once. Processes outside of the process group
+    of the parent need this, because Ctrl-C does not reach them. Outside of Linux, do nothing.
     """
     if sys.platform != 'linux':
         return

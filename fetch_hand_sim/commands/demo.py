@@ -161,7 +161,7 @@ class Demo:
     def _play(self, policy: str, watcher: Watcher, stop: StopSignals) -> int:
         """Run both nodes until the episodes are logged; return 0, or 1 after a failure.
 
-        After a failure, print the output of the nodes. `policy` is as for the option `--policy`.
+        After a failure, print the output of the nodes. `policy` is a value of `--policy`.
         """
         began = time.monotonic()
         with open_log('demo') as output:
@@ -257,7 +257,7 @@ class Demo:
 
 
 def _require_to_be_alone(watcher: Watcher, stop: StopSignals) -> None:
-    """Raise CommandError if another process would interact with the nodes of this demo."""
+    """Wait for ROS discovery; raise CommandError if another process would disturb the demo."""
     end = time.monotonic() + DISCOVERY_TIME
     while not stop and time.monotonic() < end:
         watcher.spin()

@@ -70,7 +70,7 @@ def _expand(paths: Sequence[Path]) -> tuple[list[Path], int]:
 
 
 def _check(episodes: Sequence[Path], results: list[CheckResult], is_quiet: bool) -> int:
-    """Check episodes, extend and (unless `is_quiet`) print `results`; return the exit code."""
+    """Check episodes, append to `results`, print these unless `is_quiet`; return the exit code."""
     code = EXIT_SUCCESS
     with progress('episodes', len(episodes)) as advance:
         for episode in episodes:

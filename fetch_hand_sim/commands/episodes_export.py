@@ -115,9 +115,9 @@ def _counted(episodes: Sequence[EpisodeArrays]) -> str:
 
 
 def _add(path: Path, by_task: dict[str, list[EpisodeArrays]], options: argparse.Namespace) -> bool:
-    """Load an episode into `by_task`; return False if the filters reject it.
+    """Load an episode into `by_task`; return False if the filter options reject it.
 
-    An episode that is unreadable or does not fit into the dataset raises EpisodeReadError.
+    EpisodeReadError if it is unreadable or cannot share a dataset with the task's other episodes.
     """
     # Reading a summary is much faster than reading all messages.
     summary = read_summary(path)
@@ -141,7 +141,7 @@ def _why_left_out(episode: EpisodeArrays, others: Sequence[EpisodeArrays], to: s
 
 
 def _export(options: argparse.Namespace, by_task: ByTask, name: str) -> dict[str, str]:
-    """Write a dataset per task (Minari: id from `name`); return its location, as text, by task."""
+    """Write a dataset per task and return its location, text, by task; only Minari uses `name`."""
     if options.to == 'parquet':
         files = export_parquet(by_task, options.output)
         return {task: ', '.join(map(str, paths)) for task, paths in files.items()}

@@ -148,7 +148,7 @@ def _print_table(episodes: Sequence[EpisodeSummary]) -> None:
 
 
 def _as_json(episode: EpisodeSummary) -> dict[str, Any]:
-    """Return the columns of an episode as JSON values; missing values are None."""
+    """Return the JSON object that `--json` prints for an episode; unknown values are None."""
     metadata, outcome = episode.metadata, episode.outcome
     return {
         'path': str(episode.path),

@@ -1,7 +1,7 @@
 """Complete the files of episodes that a crash or a full disk interrupted.
 
-Exit code 0: no unfinished episode is left; 1: an episode could not be recovered (stderr names it);
-2: bad usage.
+Exit code 0: no recovery failed; 1: an episode could not be recovered (stderr names it); 2: bad
+usage.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ def _without_messages(leftover: Path) -> str:
 
 
 def _recover(leftover: Path) -> bool:
-    """Recover one episode and print the result; return False if it stays unfinished."""
+    """Recover an episode and print the result; return False on an error, True if it is in use."""
     try:
         path = recover_episode(leftover)
         if path is None:

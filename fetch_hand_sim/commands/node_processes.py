@@ -25,9 +25,9 @@ _SHUTDOWN_TIMEOUT = 10.0
 
 
 def executable(name: str, parent: int | None = None) -> list[str]:
-    """Return the command line that runs an executable of this package.
+    """Return the command line that runs the executable `name` of this package.
 
-    The started process terminates when the process with the id `parent`, if given, does.
+    If `parent` is a process id, the started process terminates when that process does.
 
     Raises:
         UsageError: If this package runs from its sources and is not installed.
@@ -46,14 +46,14 @@ def executable(name: str, parent: int | None = None) -> list[str]:
 def is_actor_shipped(task: str) -> bool:
     """Return whether an installed package ships an actor for a task.
 
-    Packages name a function in the entry point group `fetch_hand_sim.actors`. It returns the
-    shipped actors by task.
+    Each entry point of the group `fetch_hand_sim.actors` is a function that returns the shipped
+    actors of its package by task.
     """
     return any(task in point.load()() for point in entry_points(group=_ACTORS))
 
 
 def open_log(name: str) -> IO[str]:
-    """Open a temporary file for the output of nodes, or raise CommandError."""
+    """Open a log file `<name>_*.log`, which is deleted when closed; CommandError if this fails."""
     try:
         return tempfile.NamedTemporaryFile('w+', prefix=f'{name}_', suffix='.log')
     except OSError as error:
@@ -65,7 +65,8 @@ def start_node(
 ) -> subprocess.Popen[str]:
     """Start the executable `name` as a child process that terminates when this process does.
 
-    Ctrl-C in the terminal does not reach it; `output` receives its stdout and stderr.
+    `parameters` are ROS parameters by name; `output` receives stdout and stderr. Ctrl-C in the
+    terminal does not reach the child process.
     """
     words = []
     for parameter, value in parameters.items():
@@ -101,7 +102,7 @@ def start_nodes(
 
 
 def stop_node(process: subprocess.Popen[str]) -> int:
-    """Terminate a node and return its exit code; 0 if SIGTERM ended it while it was loading."""
+    """Terminate a node, or kill it after 10 s; return its exit code, 0 if it was still loading."""
     if process.poll() is not None:
         return process.returncode
     # SIGINT would print a traceback while Python starts.

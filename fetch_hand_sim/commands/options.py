@@ -11,7 +11,7 @@ from msgs_spec.tasks import TASKS
 
 
 def add_filter_options(parser: argparse.ArgumentParser) -> None:
-    """Add `--task`, `--success`, `--failure` and `--complete`, which are None by default."""
+    """Add `--task`, `--success`, `--failure` and `--complete`; None (default) filters nothing."""
     parser.add_argument('--task', choices=list(TASKS), metavar='TASK', help='only this task')
     success = parser.add_mutually_exclusive_group()
     success.add_argument('--success', action='store_true', default=None, help='only successes')

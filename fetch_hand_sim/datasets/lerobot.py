@@ -67,7 +67,7 @@ def export_lerobot(
 
 @dataclass(frozen=True, slots=True)
 class _Dataset:
-    """Writes the LeRobot dataset of one task into `path`; `rate` is frames per second."""
+    """Writes the LeRobot dataset of one task into the folder `path`, `rate` frames per second."""
 
     path: Path
     spec: TaskSpec
@@ -100,7 +100,7 @@ class _Dataset:
         self._write_json('meta/info.json', self._info(rows))
 
     def _row(self, columns: Columns, where: dict[str, int]) -> Row:
-        """Return a row of `meta/episodes`; `where` has `chunk_index` and `file_index`."""
+        """Return the row of an episode in `meta/episodes`; `where` has chunk and file index."""
         index = columns['index']
         return {
             'episode_index': int(columns['episode_index'][0]),
@@ -260,7 +260,7 @@ def _feature(dtype: str, names: list[str] | None = None) -> dict[str, Any]:
 
 
 def _parts(spec: TaskSpec) -> tuple[list[str], list[str]]:
-    """Return the names of the observed values of the robot, and those of the object."""
+    """Return the names of the observed values of the robot, then of those of the object."""
     robot: list[str] = []
     rest: list[str] = []
     for part in spec.observation:
@@ -272,7 +272,7 @@ def _parts(spec: TaskSpec) -> tuple[list[str], list[str]]:
 def frames(episode: EpisodeArrays, episode_index: int, first_index: int) -> Columns:
     """Return the columns of the N frames of an episode, one frame per action.
 
-    `first_index` is the number of the first frame in the dataset.
+    `episode_index` and `first_index` number the episode and its first frame in the dataset.
     """
     spec, count = episode.spec, len(episode)
     seen = episode.observations['observation'][:count]
@@ -298,7 +298,7 @@ def frames(episode: EpisodeArrays, episode_index: int, first_index: int) -> Colu
 
 
 def statistics(values: NDArray[Any]) -> dict[str, Any]:
-    """Return min, max, mean, std, count and quantiles, by name, of a column (n,) or (n, size)."""
+    """Return min, max, mean, std, count and `QUANTILES` by name for a column (n,) or (n, size)."""
     rows = values.reshape(len(values), -1)
     numbers = rows.astype(np.float64)
     return {
@@ -371,7 +371,7 @@ class Camera:
 def write_episodes(
     path: Path, episodes: Sequence[EpisodeArrays], camera: Camera, rate: float
 ) -> list[Histogram]:
-    """Write several episodes as one film. Each lacks its last frame, which no action follows.
+    """Write several episodes as one film, each without its last frame, which has no action.
 
     Returns:
         A histogram (3, 256) of each episode: number of pixels by colour channel and level.

@@ -1,6 +1,6 @@
 """Write logged episodes as Minari datasets.
 
-Needs the extra `[data]`. The datasets contain the unchanged float64 values of `load_episodes`.
+Needs `fetch_hand_sim[data]`. The datasets contain the unchanged float64 values of `load_episodes`.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _MINARI_PATH, _NAMESPACE = 'MINARI_DATASETS_PATH', 'namespace_metadata.json'
 
 
 def dataset_name(text: str) -> str:
-    """Return the name of a dataset, with `-v0` if it has no version; UsageError if not allowed."""
+    """Return `text` as a dataset name, with `-v0` if it has no version; UsageError if invalid."""
     *folders, _ = text.split('/')
     # A folder with a version is a dataset, and Minari finds no dataset within it.
     if not _DATASET_NAME.fullmatch(text) or any(map(_VERSION.search, folders)):
@@ -54,7 +54,7 @@ def export_minari(by_task: ByTask, directory: Path, name: str) -> dict[str, str]
         name: Name such as `logged-v0` or `me/logged-v0`; the task comes before it.
 
     Returns:
-        The id of each task's dataset, `<task>/<name>`.
+        The id of the dataset, `<task>/<name>`, by task.
 
     Raises:
         UsageError: If the name is not allowed.
@@ -83,7 +83,7 @@ def export_minari(by_task: ByTask, directory: Path, name: str) -> dict[str, str]
 def _buffers(
     collector: Any, episodes: Sequence[EpisodeArrays], advance: Callable[[int], None]
 ) -> Iterator[Any]:
-    """Yield each episode as a Minari `EpisodeBuffer`; call `advance(1)` after each for progress."""
+    """Yield each episode as an `EpisodeBuffer` of module `collector`; then call `advance(1)`."""
     for index, episode in enumerate(episodes):
         yield collector.EpisodeBuffer(
             id=index,

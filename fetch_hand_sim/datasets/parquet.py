@@ -25,9 +25,10 @@ def export_parquet(by_task: ByTask, directory: Path) -> dict[str, list[Path]]:
     """Write two tables for each task; return the paths of the two files by task.
 
     `<task>.parquet` has N + 1 rows for an episode of N steps, one per observation. The first
-    columns are `episode_index`, `step`, `timestamp` in seconds since the reset, and the three
-    observations. The columns of the step that follows are `action`, `command`, `reward`,
-    `terminated`, `truncated` and `next_success`. They are null in the last row of an episode.
+    columns are `episode_index`, `step`, `timestamp` in seconds since the reset, `observation`,
+    `achieved_goal` and `desired_goal`. The columns `action`, `command`, `reward`, `terminated`,
+    `truncated` and `next_success` belong to the step that follows this observation. They are null
+    in the last row of an episode.
     `<task>_episodes.parquet` has a row per episode with its metadata and result.
 
     Raises:

@@ -28,7 +28,7 @@ class EpisodeArrays(HasOutcome):
 
     Attributes:
         path: The MCAP file.
-        spec: The task with the `episode_ticks` of the episode.
+        spec: The task with its default joint names and the `episode_ticks` of the episode.
         observations: `observation`, `achieved_goal` and `desired_goal`, (N + 1, size) each, as
             `Simulation` returns them, bit for bit.
         actions: (N, action size), normalised to [-1, 1].
@@ -69,14 +69,14 @@ class EpisodeArrays(HasOutcome):
 def load_episodes(
     path: Path | str, on_skip: Callable[[EpisodeReadError], None] | None = None
 ) -> list[EpisodeArrays]:
-    """Load one episode, or all episodes in a directory, sorted by name.
+    """Load one episode, or all episodes in a directory, sorted by name; [] if it has none.
 
     Interrupted episodes are included up to their last whole tick; their `is_complete` is False.
 
     Args:
         path: A bag directory, an MCAP file, or a directory that contains several of these.
         on_skip: Called with the error of each unreadable episode, which is left out. None raises
-            the first such EpisodeReadError.
+            the first such EpisodeReadError. A missing `path` always raises it.
     """
     return list(read_each(expand_episodes(path), load_episode, on_skip))
 
@@ -99,7 +99,7 @@ def _assembler(task: TaskSpec, control_hz: float) -> ObservationAssembler:
 
 
 def _decode(file: Episode) -> EpisodeArrays:
-    """Decode the messages of an episode into arrays; ValueError if a message is missing."""
+    """Decode an episode into arrays; ValueError if messages are missing or stamps not in order."""
     record = EpisodeRecord.parse(file.metadata)
     task, assembler = record.task, _assembler(record.task, record.control_hz)
     names = [spec.name for spec in assembler.topics]

@@ -59,7 +59,7 @@ class Attachment:
 
 @cache
 def offered_qos(spec: QosSpec) -> list[dict[str, Any]]:
-    """Return a list with one QoS profile, `spec` with all keys that rosbag2 writes."""
+    """Return `spec` as a list of one QoS profile, with every key that rosbag2 writes."""
     return [
         {
             'history': 'keep_last',
@@ -82,7 +82,7 @@ def offered_qos_text(spec: QosSpec) -> str:
 
 
 def checked_strings(content: Mapping[str, str]) -> dict[str, str]:
-    """Copy a metadata record; ValueError above `MAX_METADATA_BYTES` or `MAX_MAP_ENTRIES`."""
+    """Copy metadata; ValueError above `MAX_METADATA_BYTES` bytes or `MAX_MAP_ENTRIES` entries."""
     size = sum(len(text.encode()) for item in content.items() for text in item)
     if size > MAX_METADATA_BYTES:
         raise ValueError(f'{size} bytes of episode metadata; allowed: {MAX_METADATA_BYTES}')
@@ -104,8 +104,9 @@ class _Channel:
 class BagFile:
     """Writes one episode as an MCAP file into an open stream, which the caller closes.
 
-    An `OSError` of the stream is raised; nothing can be written after it. Metadata and attachments
-    are written first, so that a cut-off file also contains them.
+    An `OSError` of the stream is raised; nothing can be written after it. Metadata (the record
+    `episode`) and attachments are written first, so that a cut-off file also contains them.
+    `file_name` is the name of the file in `metadata.yaml`.
     """
 
     def __init__(
@@ -171,7 +172,7 @@ class BagFile:
         return self._flushes + self._bytes // CHUNK_BYTES + 1
 
     def has_room(self, size: int) -> bool:
-        """Return whether a message of `size` bytes fits: limits of messages, bytes and chunks."""
+        """Return whether the file stays within its limits with another message of `size` bytes."""
         return (
             size <= MAX_MESSAGE_BYTES
             and self.message_count < MAX_MESSAGES
@@ -186,7 +187,7 @@ class BagFile:
         self._writer.flush()  # type: ignore[no-untyped-call]
 
     def finish(self, result: dict[str, str]) -> str:
-        """Write last chunk, metadata record `result`, summary; return text of `metadata.yaml`."""
+        """Complete the file, with `result` as a metadata record; return `metadata.yaml` as text."""
         self.flush()
         custom_data = {**self._metadata, **result}
         self._writer.add_metadata(EPISODE_RESULT, result)
@@ -217,7 +218,7 @@ class BagFile:
         return {'serialized_metadata': _dump(self._description(custom_data))}
 
     def _description(self, custom_data: Mapping[str, str]) -> dict[str, Any]:
-        """Return the contents of `metadata.yaml`; rosbag2's format version 9 needs every key."""
+        """Return `metadata.yaml` with `custom_data`; rosbag2's format version 9 needs every key."""
         span = {
             'starting_time': {'nanoseconds_since_epoch': self._start_ns},
             'duration': {'nanoseconds': max(self._end_ns, 0) - self._start_ns},

@@ -33,7 +33,7 @@ def _line(message: str) -> str:
 
 
 class EpisodeLogError(RuntimeError):
-    """An episode cannot be written; the message is one line with path and reason."""
+    """An episode cannot be written or recovered; the message is one line with path and reason."""
 
     def __init__(self, message: str) -> None:
         super().__init__(_line(message))
@@ -81,7 +81,7 @@ def active_name(path: Path) -> str | None:
 
 
 def bag_file(directory: Path, name: str) -> Path:
-    """Return the MCAP file of the episode `name`; `directory` is the directory of this episode."""
+    """Return the MCAP file of the episode `name` in its own directory, final or hidden."""
     return directory / f'{name}_0.mcap'
 
 
@@ -104,7 +104,7 @@ def is_mcap(path: Path) -> bool:
 
 
 def find_episodes(directory: Path | str) -> list[Path]:
-    """Return the bag directories and MCAP files in a directory, sorted by name; open none.
+    """Return the paths of the bag directories and MCAP files in a directory, sorted by name.
 
     Directories `.<name>.active` and `.<name>.aside` are left out; see `find_leftovers`. An
     unreadable directory raises EpisodeReadError.
@@ -128,7 +128,7 @@ def _is_bag(path: Path) -> bool:
 
 
 def folders_below(directory: Path) -> str:
-    """Return the names of the first subfolders that contain episodes, as text for an error."""
+    """Return up to 3 subfolders with episodes, as the text `a, b, c and 2 more`; '' if none."""
     try:
         folders = [path for path in sorted(directory.iterdir()) if path.is_dir()]
         held = [path for path in folders if path.name[0] != '.' and find_episodes(path)]
@@ -138,7 +138,7 @@ def folders_below(directory: Path) -> str:
 
 
 def holds_no_episode(directory: Path) -> EpisodeReadError:
-    """Return the error for a folder without episodes; it names subfolders that contain some."""
+    """Return an error for a folder without episodes; its text names subfolders that have some."""
     below = folders_below(directory)
     return EpisodeReadError(
         f'{directory} holds no episode{f"; there are some in {below}" if below else ""}'
@@ -146,7 +146,7 @@ def holds_no_episode(directory: Path) -> EpisodeReadError:
 
 
 def expand_episodes(path: Path | str) -> list[Path]:
-    """Return the episodes in a directory, or only `path` if it is a bag or a file.
+    """Return the episodes in the directory `path`, or [`path`] if it is itself a bag or a file.
 
     A missing or unreadable path raises EpisodeReadError.
     """
@@ -166,7 +166,7 @@ def read_each(
     read: Callable[[Path], Read],
     on_skip: Callable[[EpisodeReadError], object] | None = None,
 ) -> Iterator[Read]:
-    """Yield `read(path)` for each path; pass EpisodeReadError to `on_skip`, or raise it if None."""
+    """Yield `read(path)` of each path; pass EpisodeReadError to `on_skip` if given, or raise it."""
     for path in paths:
         try:
             result = read(path)
@@ -246,14 +246,14 @@ def require_free_space(directory: Path, minimum_bytes: int) -> None:
 
 
 def lock(stream: IO[bytes]) -> None:
-    """Lock a file that this process writes, until it is closed; wait for another process's lock."""
+    """Lock a file for writing until it is closed; wait while another process holds a lock."""
     # File systems without locks only lose the distinction between running and cut-off episodes.
     with suppress(OSError):
         fcntl.flock(stream, fcntl.LOCK_EX)
 
 
 def try_lock(stream: IO[bytes], shared: bool = False) -> bool:
-    """Lock a file without waiting; return False if another process holds the lock."""
+    """Lock a file, for reading if `shared`; return False at once if another lock prevents it."""
     try:
         fcntl.flock(stream, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
     except BlockingIOError:
@@ -278,7 +278,7 @@ def create(path: Path) -> BinaryIO:
 
 
 def is_locked(path: Path) -> bool:
-    """Return whether a process holds the write lock of a regular file."""
+    """Return whether a process holds the write lock of a file; OSError if it is not regular."""
     with open_regular(path) as stream:
         return not try_lock(stream, shared=True)
 
@@ -293,7 +293,7 @@ def sync_directory(path: Path) -> None:
 
 
 def store(stream: IO[bytes], directory: Path, description: str) -> None:
-    """Write `description` as `metadata.yaml`; flush it and the MCAP file to disk (fsync)."""
+    """Write `directory`/metadata.yaml with `description`; fsync it and the MCAP file `stream`."""
     stream.flush()
     os.fsync(stream.fileno())
     with create(metadata_file(directory)) as text:

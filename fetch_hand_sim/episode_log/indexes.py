@@ -52,7 +52,7 @@ Summary = dict[int, list[tuple[int, int]]]
 
 
 def parse_file(data: bytes) -> tuple[Contents, Messages]:
-    """Parse a whole file; ValueError if it is damaged, ambiguous, or larger than the limits."""
+    """Parse a whole MCAP file; ValueError if it is damaged, ambiguous, or exceeds the limits."""
     if not data.endswith(MCAP0_MAGIC):
         raise ValueError('truncated, damaged or no MCAP file: its last bytes are not those of one')
     contents = Contents()
@@ -110,7 +110,7 @@ def _fields(data: bytes, position: int, end: int) -> Fields:
 
 
 def _numbers(data: bytes, position: int, end: int, layout: struct.Struct) -> tuple[int, ...]:
-    """Return the fields of the record `data[position:end]`, which contains only numbers."""
+    """Return the numbers of the record `data[position:end]`; ValueError if its size is wrong."""
     fields = _fields(data, position, end)
     numbers = fields.numbers(layout)
     fields.end()
@@ -124,7 +124,7 @@ def _check_data_crc(data: bytes, position: int, end: int) -> None:
 
 
 def _check_footer(data: bytes, summary: Summary, summary_start: int) -> None:
-    """Check that the file ends with one footer, which has position and CRC of the summary."""
+    """Raise ValueError unless the file ends with one footer that fits the summary."""
     footers = summary[Opcode.FOOTER]
     if len(footers) != 1 or footers[0][1] != len(data) - len(MCAP0_MAGIC):
         raise ValueError('truncated or damaged: the file does not end with one footer')
@@ -152,7 +152,7 @@ def _check_offsets(data: bytes, summary: Summary) -> None:
 
 
 def _check_record_indexes(data: bytes, summary: Summary, contents: Contents) -> None:
-    """Raise ValueError if the index of metadata or attachments is incomplete, but not missing."""
+    """Raise ValueError if an index of metadata or attachments exists and is wrong."""
     for what, opcode, expected in (
         ('metadata', Opcode.METADATA_INDEX, [each.index for each in contents.metadata]),
         ('attachments', Opcode.ATTACHMENT_INDEX, [each.index for each in contents.attachments]),
@@ -165,7 +165,7 @@ def _check_record_indexes(data: bytes, summary: Summary, contents: Contents) -> 
 def _check_chunk_indexes(
     data: bytes, summary: Summary, contents: Contents, messages: Messages
 ) -> None:
-    """Check that the chunk indexes are missing, or list each chunk with its position and size."""
+    """Raise ValueError if chunk indexes exist and are wrong, or times in a chunk header are."""
     _check_chunk_times(contents, messages)
     if not summary[Opcode.CHUNK_INDEX]:
         return
@@ -201,7 +201,7 @@ def _check_chunk_indexes(
 
 
 def _check_chunk_times(contents: Contents, messages: Messages) -> None:
-    """Raise ValueError if a chunk header has other times than its messages; 0, 0 is allowed."""
+    """Raise ValueError if first and last time in a chunk header are wrong; (0, 0) is allowed."""
     order = np.argsort(messages.starts)
     starts, times = messages.starts[order], messages.headers['log_time'][order]
     for chunk in contents.chunks:
@@ -236,7 +236,7 @@ def _check_message_indexes(contents: Contents, messages: Messages) -> None:
 def _check_statistics(
     data: bytes, summary: Summary, contents: Contents, messages: Messages
 ) -> None:
-    """Raise ValueError if the statistics are wrong; counts other than that of messages may be 0."""
+    """Raise ValueError if the statistics are wrong; counts except that of messages may be 0."""
     if len(summary[Opcode.STATISTICS]) > 1:
         raise ValueError('ambiguous: two records of statistics')
     for position, end in summary[Opcode.STATISTICS]:

@@ -49,7 +49,7 @@ class EpisodeRecord:
     """Contents of the metadata record `episode`.
 
     Attributes:
-        task: The task at 25 Hz, with the joint names of the messages; see also `spec`.
+        task: The task with the joint names of the messages and `episode_ticks` at 25 Hz.
         episode: Number of the episode in its run, from 0.
         control_hz: Ticks per simulated second.
         interface_version: Version of the messages, see `msgs_spec.topics.INTERFACE_VERSION`.
@@ -98,11 +98,12 @@ class EpisodeRecord:
 
 @dataclass(frozen=True, slots=True)
 class EpisodeOutcome:
-    """Contents of the metadata record `episode_result`; None for missing values.
+    """Contents of the metadata record `episode_result`; missing values are None.
 
     Attributes:
-        received_not_logged: Number of messages left out of the file, which limits their number and
-            bytes, by topic; `<topic> (refused)` counts messages that the robot rejected.
+        is_complete: Whether the episode ran to its last step; False if the file lacks it.
+        received_not_logged: Number of received messages, by topic, that the limits of a file left
+            out; `<topic> (refused)` counts those that the robot had rejected. {} if none.
         late_commands: Steps whose command was not computed from the observation right before; None
             in lockstep, in generated episodes and in files of interface version 1.
     """
@@ -159,12 +160,12 @@ class HasOutcome:
 
     @property
     def is_complete(self) -> bool:
-        """True if the episode ran to its end, False if it was interrupted."""
+        """True if the episode ran to its last step, False if it was interrupted or diverged."""
         return self.outcome.is_complete
 
 
 def parse_task(metadata: Strings) -> TaskSpec:
-    """Return the task with the joint names of the messages; ValueError if it is unknown."""
+    """Return the task with the joint names of the messages; ValueError if a value is invalid."""
     name = _text(metadata, 'task')
     return task_spec(name if name in TASKS else name[:_SHOWN], _joint_prefix(metadata))
 
@@ -181,7 +182,7 @@ def parse_control_hz(metadata: Strings) -> float:
 
 
 def integer_or_none(metadata: Strings, name: str) -> int | None:
-    """Return the integer `name` of the record `episode`; None if missing or out of range."""
+    """Return the value `name` of the record `episode`; None unless an integer 0 ... 2**63 - 1."""
     try:
         return _number(metadata, name, int)
     except ValueError:
@@ -226,7 +227,7 @@ def _flag(text: str) -> bool | None:
 
 
 def _number_or_none(text: str, kind: type[Number]) -> Number | None:
-    """Parse a finite number within the range of int64; None for other text."""
+    """Return the number in a text; None for other text and beyond +-(2**63 - 1)."""
     try:
         value = kind(text)
     except ValueError:

@@ -42,7 +42,7 @@ _LONGEST_SCHEMA = 8000
 
 @dataclass(frozen=True, slots=True)
 class LoggedMessage:
-    """A message of an episode; `sequence` is its number in its topic, `data` are CDR bytes."""
+    """A message of an episode; `sequence` is its index in its topic, `data` are CDR bytes."""
 
     log_time_ns: int
     publish_time_ns: int
@@ -68,6 +68,8 @@ class EpisodeSummary(HasOutcome):
     """An episode without its messages; `path` is the MCAP file.
 
     Attributes:
+        metadata: The metadata record `episode`, which describes the episode.
+        result: The metadata record `episode_result`, which describes how it ended.
         duration_s: Simulated seconds from the first message to the last.
     """
 
@@ -105,13 +107,13 @@ class Episode(EpisodeSummary):
         return {self.channels[id].topic: logged for id, logged in found.items()}
 
     def count(self, name: str) -> int:
-        """Return the number of messages of a topic, named without its namespace."""
+        """Return the number of messages of a topic, named without its namespace; 0 if unknown."""
         return len(self._indices(name))
 
     def rows(self, name: str) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
         """Return the log times (n,), ns, and the CDR bytes (n, size) of all messages of a topic.
 
-        A topic without messages, or with messages of different sizes, raises ValueError.
+        `name` has no namespace. No messages, or messages of different sizes, raise ValueError.
         """
         indices, messages = self._indices(name), self.sorted_messages
         starts, headers = messages.starts[indices], messages.headers[indices]
@@ -184,7 +186,7 @@ def one_line_errors(file: Path) -> Iterator[None]:
 
 
 def _why_unfinished(file: Path) -> str:
-    """Return a hint if the file belongs to an unfinished episode, else ''."""
+    """Return why the file of an unfinished episode is incomplete; '' for a finished episode."""
     if files.active_name(file.parent) is None:
         return ''
     with suppress(OSError):
@@ -200,7 +202,7 @@ def _why_unfinished(file: Path) -> str:
 
 
 def require_contract(metadata: dict[str, str], contents: Contents) -> None:
-    """Raise ValueError if a file has topics that its task does not allow.
+    """Raise ValueError if a parsed file has topics that the task in `metadata` does not allow.
 
     Name, type, encoding and message definition of each topic must be those of `contract_topics`.
     All topics must have the same namespace. A file with an unknown task is not checked.
@@ -244,7 +246,7 @@ def contract_topics(task: TaskSpec) -> dict[str, TopicSpec]:
 
 @lru_cache(maxsize=256)
 def _defines(type_name: str, text: bytes) -> bool:
-    """Return whether a message definition (`ros2msg`) has the fields of the type in ROS 2 Jazzy."""
+    """Return whether a definition in `ros2msg` has the same fields as the type in ROS 2 Jazzy."""
     expected = schema_text(type_name)
     if text == expected.encode():
         return True
@@ -291,7 +293,7 @@ class LoggedTick:
     received: list[TickMessage] = field(default_factory=list)
 
     def find(self, name: str) -> TickMessage | None:
-        """Return the message that the robot published on a topic, None without one."""
+        """Return the robot's message on a topic, named without namespace; None if missing."""
         return next((m for m in self.published if m.topic.name == name), None)
 
 

@@ -78,7 +78,7 @@ _LATEST_NS = 2**63 - 1
 
 
 class Fields:
-    """Reads the fields of one record, one after the other.
+    """Reads the little-endian fields of one record, one after the other.
 
     Methods raise `ValueError` if the record is too short, or if text is not UTF-8.
     """
@@ -122,7 +122,7 @@ class Fields:
         return self._data[start : self._position].decode()
 
     def strings(self) -> dict[str, str]:
-        """Read a map from text to text; ValueError for too many entries or a repeated key."""
+        """Read a map of text to text; ValueError for a repeated key or over `MAX_MAP_ENTRIES`."""
         fields = Fields(self.bytes(self.number(4)), self._kind)
         found: dict[str, str] = {}
         while not fields.is_at_end:
@@ -193,7 +193,7 @@ class MessageIndex(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class MetadataRecord:
-    """A metadata record; `index` is the content that its index record must have."""
+    """A metadata record; `index` has the bytes that its index record in the summary must have."""
 
     index: bytes
     name: str
@@ -202,7 +202,7 @@ class MetadataRecord:
 
 @dataclass(frozen=True, slots=True)
 class AttachmentRecord:
-    """An attachment; `index` is the content that its index record must have."""
+    """An attachment; `index` has the bytes that its index record in the summary must have."""
 
     index: bytes
     name: str
@@ -234,7 +234,7 @@ class Contents:
         self._channel_starts: dict[int, int] = {}
 
     def take(self, opcode: int, data: bytes, position: int, end: int) -> None:
-        """Parse and store the record `data[position:end]`."""
+        """Parse the record `data[position:end]`; store it if it belongs to the data section."""
         start = position + RECORD.size
         if opcode == _MESSAGE_INDEX:
             self._take_message_index(data[start:end], position)
@@ -254,7 +254,7 @@ class Contents:
             self._take_attachment(data[start:end], position, end - position)
 
     def define(self, opcode: int, content: bytes, offset: int = 0) -> None:
-        """Parse and store a schema or channel; `offset` is its position in the unpacked chunk."""
+        """Parse and store a schema or channel from byte `offset` of the unpacked chunk."""
         id = int.from_bytes(content[:2], 'little')
         known = self._definitions.get((opcode, id))
         if known == content:
@@ -291,7 +291,7 @@ class Contents:
     def messages(self) -> Messages:
         """Return all messages, sorted by log time.
 
-        Equal times, times beyond int64, and messages before their channel raise ValueError.
+        Equal log times, times beyond int64, and messages before their channel raise ValueError.
         """
         unpacked = b''.join(self._runs)
         starts = np.array(self._starts, dtype=np.int64)
@@ -342,7 +342,7 @@ class Contents:
         )
 
     def _take_run(self, data: bytes) -> None:
-        """Parse and store consecutive records: schemas, channels and messages."""
+        """Parse and store the schemas, channels and messages in `data`, consecutive records."""
         starts: list[int] = []
         position, end, base = 0, len(data), self._size
         read = RECORD.unpack_from
@@ -421,7 +421,7 @@ class Messages:
     headers: NDArray[np.void]
 
     def rows(self) -> Iterator[tuple[int, int, int, int, bytes]]:
-        """Yield channel, sequence, log time, publish time and data of each message."""
+        """Yield channel id, sequence, log and publish time (ns) and data of each message."""
         for start, header in zip(self.starts.tolist(), self.headers.tolist(), strict=True):
             _, size, channel, sequence, log_time, publish_time = header
             data = self.unpacked[start + MESSAGE.itemsize : start + RECORD.size + size]
@@ -432,8 +432,8 @@ def split_records(data: bytes) -> Iterator[tuple[int, int, int]]:
     """Yield opcode, start and end of each record of a file, beginning with the header record.
 
     `data[start:end]` is the whole record. A missing header, a cut-off record and more than
-    `MAX_RECORDS` records raise ValueError. The caller removes the magic bytes at the end of `data`,
-    or stops at the footer.
+    `MAX_RECORDS` records raise ValueError. So do the magic bytes after the footer: the caller
+    removes them or stops at the footer.
     """
     magic = len(MCAP0_MAGIC)
     if data[:magic] != MCAP0_MAGIC:
@@ -455,7 +455,7 @@ def split_records(data: bytes) -> Iterator[tuple[int, int, int]]:
 
 
 def _unpack(packed: bytes, compression: str, size: int) -> bytes:
-    """Decompress a chunk; ValueError unless the result has `size` bytes."""
+    """Decompress a chunk (`zstd`, `lz4` or ''); ValueError unless the result has `size` bytes."""
     try:
         data = _decompress(packed, compression, size)
     except (zstandard.ZstdError, RuntimeError, EOFError) as error:

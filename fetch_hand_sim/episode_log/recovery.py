@@ -51,9 +51,9 @@ class Leftover:
     """An unfinished episode that no process is writing.
 
     Attributes:
-        name: Name of the episode.
-        path: Its hidden directory.
-        age_s: Seconds since the last write.
+        path: Hidden directory of the episode.
+        size_bytes: Total size of its files; 0 with a `problem`.
+        age_s: Seconds since the last write; 0 with a `problem`.
         problem: Why recovery rejects the path: it is unreadable, is no directory, or contains
             entries that this package does not write; '' otherwise.
     """
@@ -91,7 +91,7 @@ def find_leftovers(directory: Path | str) -> list[Leftover]:
 
 
 def _inspect(path: Path) -> Leftover | None:
-    """Describe a leftover; return None for other paths and while a process is writing it."""
+    """Return the leftover at `path`; None if it is in use, gone, or not named `.<name>.active`."""
     name = files.active_name(path)
     if name is None:
         return None
@@ -111,7 +111,7 @@ def _inspect(path: Path) -> Leftover | None:
 
 
 def _entries(path: Path, name: str) -> list[Path]:
-    """Return the files in a leftover; OSError for a file that this package does not write."""
+    """Return the files of a leftover; OSError if it is no directory or has unknown entries."""
     if not stat.S_ISDIR(path.lstat().st_mode):
         raise NotADirectoryError(errno.ENOTDIR, 'is no directory', str(path))
     file = files.bag_file(path, name)
@@ -126,14 +126,14 @@ def _entries(path: Path, name: str) -> list[Path]:
 
 
 def recover_episode(leftover: Path | str) -> Path | None:
-    """Make a valid bag of an unfinished episode; return its directory, or None without messages.
+    """Make a valid bag of the episode in the hidden directory `leftover`; return the bag's path.
 
     The bag contains all complete chunks; at most the last quarter of a second is missing. The new
-    file is read back before it replaces the cut-off file. If more than a few bytes of the cut-off
+    file is read back before it replaces the cut-off file. If more than 64 bytes of the cut-off
     file are unreadable, a copy of it is kept in `.<name>.aside`.
 
-    An episode without readable messages is moved to `.<name>.aside`. If its file contains at most a
-    few bytes after the header, it is removed instead.
+    Without readable messages, return None and move the hidden directory to `.<name>.aside`. If the
+    file contains at most 64 bytes after the header, remove the directory instead.
 
     Raises:
         EpisodeInUseError: If another process writes, recovers or has recovered the episode.
@@ -216,8 +216,8 @@ class _Remains:
 
     Attributes:
         contents: Records before the first damaged one.
-        is_whole: Whether the file has a footer.
-        is_empty: Whether the file contains at most a few bytes after the header.
+        is_whole: Whether reading reached the footer, which only a complete file has.
+        is_empty: Whether the file contains at most 64 bytes after the header.
         damage: Description of the damage at which reading stopped; '' without damage.
         unread_bytes: Bytes from the damage to the end of the file.
     """
@@ -256,9 +256,9 @@ def _read(stream: BinaryIO) -> _Remains:
 
 @contextmanager
 def _replaced(file: Path, remains: _Remains, aside: Path) -> Iterator[None]:
-    """Replace a cut-off file by a valid one, which stays locked until the block ends.
+    """Replace a cut-off file by a valid one, run the block, then unlock the valid file.
 
-    The cut-off file is copied to `aside` if more than a few bytes of it are unreadable.
+    The cut-off file is copied into the folder `aside` if more than 64 bytes of it are unreadable.
     """
     contents = remains.contents
     records = {record.name: record.content for record in contents.metadata}
@@ -287,9 +287,9 @@ def _replaced(file: Path, remains: _Remains, aside: Path) -> Iterator[None]:
 def _write(
     stream: BinaryIO, file: Path, remains: _Remains, records: dict[str, dict[str, str]]
 ) -> str:
-    """Write the readable records as a valid file; return the text of its `metadata.yaml`.
+    """Write the readable records to `stream` as a valid bag; return the text of `metadata.yaml`.
 
-    `records` are the contents of the metadata records by name.
+    The text contains the name of `file`. `records` has the contents of metadata records by name.
     """
     contents, metadata = remains.contents, checked_strings(records[EPISODE])
     messages = contents.messages()
@@ -313,10 +313,10 @@ def _write(
 
 
 def _outcome(values: dict[str, list[bytes]], specs: dict[str, TopicSpec]) -> EpisodeOutcome:
-    """Compute steps, return and success from the messages up to the last whole tick.
+    """Return steps, return and success at the last whole tick, computed from the messages.
 
-    `values` are the CDR messages on `reward`, `is_success` and `applied_command`, in this order.
-    All three results are None if messages are missing or invalid.
+    `values` has the CDR messages on `reward`, `is_success` and `applied_command`, in this order.
+    The three results are None if messages are missing or invalid. `specs` has the topics by name.
     """
     cut_off = EpisodeOutcome(is_complete=False, reason=RECOVERED)
     rewards, successes, commands = values.values()

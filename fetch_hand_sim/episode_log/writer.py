@@ -37,9 +37,9 @@ _NAME = re.compile(r'\.?(?P<task>.+)_(?P<index>\d+)_seed(?P<seed>\d+)(\.active|\
 
 
 class ReceivedAllowance:
-    """Limits how many received messages of an episode are logged, in number and bytes per topic.
+    """Limits the received messages of an episode that are logged, in number and bytes per topic.
 
-    `omitted` is the number of messages beyond the limit, by topic.
+    `omitted` is the number of messages that are not logged, by topic.
     """
 
     def __init__(self) -> None:
@@ -53,8 +53,8 @@ class ReceivedAllowance:
         """Count a received message of `size` bytes; return whether to log it.
 
         `has_room=False` means that the file is full: the message is not logged. Messages that the
-        robot rejected (`is_refused`) may use at most half of the limit, so that room remains for
-        valid messages. `omitted` lists them as `<topic> (refused)`.
+        robot rejected (`is_refused`) may use at most half of each limit, so that room remains for
+        valid messages. `omitted` lists rejected messages as `<topic> (refused)`.
         """
         share = 2 if is_refused else 1
         if (
@@ -132,8 +132,8 @@ class EpisodeWriter:
         """Append the messages (topic, CDR bytes) of a tick; return False after an error or `end`.
 
         Raises:
-            EpisodeLogError: At the first disk error, or if the episode is too long. The part
-                written before can be recovered.
+            EpisodeLogError: At the first disk error, or if the file is full. The part written
+                before can be recovered.
         """
         self._tick_ns, self._rank = stamp_ns, 0
         for topic, data in messages:
@@ -147,7 +147,7 @@ class EpisodeWriter:
         """Append a message received since the last tick; return whether it is logged.
 
         Returns False beyond the limits of `ReceivedAllowance` or of the file, after an error, or
-        after `end`. `is_refused` marks messages that the robot rejected; half of the limits apply.
+        after `end`. `is_refused` marks a message that the robot rejected; half of a limit applies.
 
         Raises:
             EpisodeLogError: At the first disk error.
@@ -212,7 +212,7 @@ class EpisodeWriter:
         return True
 
     def store(self) -> Path | None:
-        """Sync and rename the bag after `end`; return its directory, or None if there is no bag."""
+        """Sync and rename the bag; return its directory, or None if `end` has not returned True."""
         if self._description is None:
             return self._completed
         try:

@@ -86,9 +86,9 @@ class CheckResult:
 
     Attributes:
         path: The MCAP file.
-        ticks: Number of identical ticks.
-        messages: Number of published messages in the identical ticks.
-        unchecked: Number of messages in an incomplete last tick, which cannot be checked.
+        ticks: Number of identical ticks, up to the first difference.
+        messages: Number of messages that the robot published in these ticks.
+        unchecked: Number of messages in a last tick without `applied_command`, which cannot be checked.
         difference: The first difference; None if the episode is identical.
         changed: Software versions that differ from the recorded ones: `name recorded -> here`.
     """
@@ -113,8 +113,8 @@ class CheckResult:
 def _reference(task: str, **rules: Any) -> tuple[Simulation, RecordingContext, str]:
     """Return (simulation, recording context, old model hash) to compare an episode with.
 
-    The hash is `former_model_sha256` of the model, which files of version 1.0 contain. `rules` are
-    arguments of `Simulation`. The last result is cached: most episodes of a folder share settings.
+    The context creates metadata of a recording made now. The hash is the one that files of version
+    1.0 contain. `rules` are arguments of `Simulation`. The last result is cached.
     """
     simulation = Simulation(task, num_threads=1, **rules)
     context = RecordingContext(simulation, with_compiled_model=False)
@@ -174,8 +174,8 @@ def _start_differences(
 ) -> Iterator[Difference]:
     """Compare the recorded metadata and MJCF text with `here` and `mjcf`; yield the differences.
 
-    `here` is the metadata of a recording made now. Other software versions are no differences; they
-    are added to `result.changed`.
+    `here` is the metadata of a recording made now, `mjcf` its MJCF text. Other software versions
+    are no differences; they are added to `result.changed`.
     """
     recorded = episode.metadata
     for name, value in here.items():
@@ -193,7 +193,10 @@ def _start_differences(
 
 
 def _topic_differences(episode: Episode, ticks: list[LoggedTick]) -> Iterator[Difference]:
-    """Yield type hashes, QoS profiles, publish times and sequence numbers that are wrong."""
+    """Yield wrong type hashes, QoS profiles, publish times and sequence numbers of messages.
+
+    Publish times must equal log times; sequence numbers must count up from 0.
+    """
     stamps = [tick.stamp_ns for tick in ticks]
     for name, spec in logged_topics(episode).items():
         logged = episode.topics[name]
@@ -270,9 +273,9 @@ def _require_goals(episode: Episode) -> None:
 
 
 def _as_of(interface_version: int, tick: Tick) -> Tick:
-    """Return the tick as a robot of an older interface version publishes it.
+    """Return `tick` as a robot with this interface version publishes it.
 
-    In version 1 all orientations in `fingertip_poses` were the identity.
+    In version 1 all orientations in `fingertip_poses` were the identity; later ones keep `tick`.
     """
     if interface_version != 1 or 'fingertip_poses' not in tick.readings:
         return tick
@@ -284,7 +287,7 @@ def _as_of(interface_version: int, tick: Tick) -> Tick:
 def _result_differences(
     last: LoggedTick, status: EpisodeStatus, runner: EpisodeRunner, episode: Episode
 ) -> Iterator[Difference]:
-    """Yield differences between the record `episode_result` and the last simulated tick."""
+    """Yield differences between the record `episode_result` and `status`, the simulated end."""
     # An interrupted recording can contain all ticks and no end of the episode.
     is_whole = runner.is_between_episodes and episode.result.get('complete') != 'false'
     expected = {**episode_result(status), 'complete': 'true' if is_whole else 'false'}
@@ -319,7 +322,7 @@ class _Received:
     def differences(self, number: int, command: Array) -> Iterator[tuple[str, object, object]]:
         """Yield (field, applied, received) if the robot applied another command than it received.
 
-        `command` was applied at tick `number`. Yield nothing without a command since the last tick.
+        `command` was applied at tick `number`. Yield nothing if the file has no newer command.
         """
         if not number:
             self._commands.start_episode(self._runner.resting_command())
@@ -373,7 +376,7 @@ def _tick_differences(
 
 
 def _field_difference(topic: TopicSpec, recorded: bytes, simulated: bytes) -> tuple[str, str, str]:
-    """Return (field, recorded, simulated) of the first differing field; '' if only bytes differ."""
+    """Return (field, recorded, simulated) where they first differ; field '' if only bytes do."""
     try:
         first, second = (deserialize(topic.type_name, data) for data in (recorded, simulated))
     except ValueError:

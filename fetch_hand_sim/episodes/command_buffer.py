@@ -30,8 +30,8 @@ class CommandBuffer:
     The robot holds its position after `timeout` wall-clock seconds without a command; 0: never.
 
     Attributes:
-        far_out: Number of commands that were far out of range, probably in another unit.
-        last_far_out: Description of the last such value and its limits.
+        far_out: Number of commands that were beyond a limit by more than twice the range.
+        last_far_out: Description of the last such value and its limits; '' if there was none.
         last_rejection: Why the last command was rejected; '' if it was valid.
         has_fresh_command: Whether a command arrived since the last `take` or `start_episode`.
         answered_stamp: Stamp of the observation from which the last command was computed,
@@ -71,15 +71,15 @@ class CommandBuffer:
         """Drop the last command, because an episode starts.
 
         Args:
-            resting_command: (action size,) applies until the first command. If that is a command
-                by joint name, the joints it leaves out keep these values.
+            resting_command: (action size,), the command until the first one arrives. Joints that
+                `accept_named` does not name keep these values, if no command came before.
         """
         self._resting = np.array(resting_command, dtype=np.float64)
         self._command = None
         self.has_fresh_command = False
 
     def accept(self, values: ArrayLike, answered_stamp: int | None = None) -> None:
-        """Store a command for all joints; ValueError, and no change, if it is invalid.
+        """Store a command, clipped to the limits; ValueError for a wrong size or non-finite value.
 
         Args:
             values: (action size,) in the order of the robot's commands, command units.
@@ -92,7 +92,10 @@ class CommandBuffer:
         self._store(command, answered_stamp)
 
     def accept_named(self, names: Sequence[str], positions: ArrayLike) -> None:
-        """Store targets of the joints `names`; other targets stay. ValueError if invalid."""
+        """Store targets, in command units, of the joints `names`; the other targets stay.
+
+        Unknown or repeated names, wrong sizes and values that are not finite raise ValueError.
+        """
         values = np.asarray(positions, dtype=np.float64).ravel()
         if len(names) != values.size:
             self._reject('wrong size', f'{len(names)} names but {values.size} positions given')
@@ -111,16 +114,16 @@ class CommandBuffer:
         self._store(command)
 
     def count_rejection(self, reason: str, line: str) -> None:
-        """Count a rejected message under the short `reason`; `line` is the full description."""
+        """Count a rejected message under the key `reason`; `last_rejection` becomes `line`."""
         self.rejected[reason] += 1
         self.last_rejection = line
 
     def take(self) -> Array:
         """Return the command of the next tick, (action size,), command units, within limits.
 
-        This is the resting command before the first command of the episode. After `timeout` seconds
-        without a new command, it holds the robot. A command that arrived since the last tick always
-        applies, even if it is older than `timeout`.
+        The resting command applies before the first command of the episode. After `timeout` seconds
+        without a new command, the arm stops; grip and joint targets stay. A command that arrived
+        since the last tick always applies, even if it is older than `timeout`.
         """
         is_fresh, self.has_fresh_command = self.has_fresh_command, False
         if self._command is None:
@@ -129,7 +132,7 @@ class CommandBuffer:
         return self._holding(self._command) if is_late else self._command
 
     def _holding(self, command: Array) -> Array:
-        """Return the command that holds the robot: the arm stops, grip and joint targets stay."""
+        """Return `command` changed so that the arm stops; grip and joint targets stay."""
         if not self._robot.has_gripper_command:
             return command
         keeps = [part.name == 'gripper' for part in self._robot.command]

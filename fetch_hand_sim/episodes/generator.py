@@ -41,7 +41,8 @@ _COMPLETING_THREADS = 4
 class _Robot:
     """One robot of the batch in one episode.
 
-    `messages` contains stamp, published messages and received command of each tick so far.
+    `messages` contains stamp (ns), published messages and received command of each tick. The
+    command is None until it is received.
     """
 
     episode: RobotEpisode
@@ -49,7 +50,7 @@ class _Robot:
 
 
 class EpisodeGenerator:
-    """Runs a policy in all N robots of a simulation and logs every episode.
+    """Runs a policy in all N robots of a simulation and logs every episode to `directory`.
 
     The policy `act` maps observations to actions (N, action size) in [-1, 1]. `on_start` is called
     with the N seeds whenever episodes begin.
@@ -104,7 +105,7 @@ class EpisodeGenerator:
         return _Robot(RobotEpisode(self._simulation, episode, first_seed + episode, stamp_ns))
 
     def _run(self, robots: Sequence[_Robot], first_seed: int) -> None:
-        """Run one episode in each of `robots`; further robots of the simulation are not logged."""
+        """Run one episode in all robots, with seeds from `first_seed` on; record only `robots`."""
         simulation, robot_spec = self._simulation, self._simulation.spec.robot
         simulation.reset(seed=first_seed)
         if self._on_start is not None:
@@ -132,7 +133,7 @@ class EpisodeGenerator:
         robot.messages.append((tick.stamp_ns, messages, None))
 
     def _receive(self, robots: Sequence[_Robot], commands: Array) -> None:
-        """Encode the commands as `policy_node` does and add them to the last ticks of `robots`."""
+        """Encode commands (N, action size) as CDR and add each to the last tick of its robot."""
         for robot, command in zip(robots, commands, strict=False):
             if not robot.episode.is_finished:
                 stamp_ns, messages, _ = robot.messages[-1]
@@ -161,7 +162,7 @@ class EpisodeGenerator:
 
 
 def _completed(waiting: deque[Future[LoggedEpisode]]) -> Iterator[LoggedEpisode]:
-    """Yield the results in order; after Ctrl-C, `waiting` contains those not yet yielded."""
+    """Wait for the results and yield them in order; `waiting` keeps those not yet yielded."""
     while waiting:
         logged = waiting[0].result()
         waiting.popleft()

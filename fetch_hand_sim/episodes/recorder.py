@@ -125,6 +125,7 @@ class EpisodeRecorder:
 
     Args:
         directory: Folder of the bags.
+        namespace: Namespace of the robot, which precedes topic names in the bags.
         metadata: Returns the metadata of a new episode; called with its first status.
         on_error: Called once, with one line, when logging fails; from any thread.
         on_logged: Called for every completed file; from a thread of the recorder.
@@ -195,7 +196,7 @@ class EpisodeRecorder:
 
         Args:
             reason: End reason of an episode that is still running.
-            gives_up: Called repeatedly during the wait; ends it by returning True. Then
+            gives_up: Called every 0.1 s during the wait; True ends the wait. Then
                 `fetch_hand_sim episodes recover` can complete the unfinished files.
         """
         self._end(reason)
@@ -215,7 +216,7 @@ class EpisodeRecorder:
     # The robot's thread
 
     def _end(self, reason: str | None) -> None:
-        """Complete the file of the running episode, if any; a reason marks it as cut short."""
+        """Complete the file of the running episode, if any; `reason` is None at its regular end."""
         tick, self._last_tick = self._last_tick, None
         if tick is not None:
             self._put(partial(self._finish, tick, reason))
@@ -239,7 +240,7 @@ class EpisodeRecorder:
             self._report_slow(now)
 
     def _oldest(self, now: float) -> float:
-        """Return when the oldest message not yet passed to the OS was queued; if none, `now`."""
+        """Return when the oldest message not yet passed to the OS was queued, s; if none, `now`."""
         since = self._unflushed_since
         if since is not None:
             return since
@@ -284,7 +285,7 @@ class EpisodeRecorder:
             self._unstored.put(None)
 
     def _run_next(self) -> bool:
-        """Run the next task, or flush if that is due; return False when the recorder is closed."""
+        """Run the next task, or pass messages to the OS if due; return False when closed."""
         task: Task | None = self._flush
         try:
             entry = self._tasks.get(timeout=self._time_to_flush())
@@ -389,7 +390,7 @@ def former_model_sha256(model: mujoco.MjModel) -> str:
 
 
 def _contents(struct: Any, prefix: str = '') -> Iterator[tuple[str, bytes]]:
-    """Yield name and bytes of each field of a MuJoCo structure and its nested structures."""
+    """Yield name and bytes of each field of a MuJoCo structure and nested ones, except paths."""
     for name in dir(struct):
         if name.startswith('_') or name in _LEFT_OUT:
             continue

@@ -35,10 +35,10 @@ class Sensed:
     Attributes:
         readings: Sensor readings by name, (N, size) each.
         true_readings: Readings without disturbances; None if disturbances are off.
-        achieved: Achieved goals, (N, goal size).
+        achieved: Achieved goals by the undisturbed readings, (N, goal size).
         desired: Desired goals, (N, goal size).
         reward: (N,).
-        success: (N,) whether the goal is reached.
+        success: (N,) whether the goal is reached at this tick.
     """
 
     readings: Readings
@@ -66,7 +66,7 @@ def has_ended(ticks: Any, episode_ticks: int, has_diverged: Any) -> Any:
 
 
 class RobotEpisode:
-    """Makes the ticks of one episode of one robot of a simulation."""
+    """Makes the ticks of one episode of a robot; call `start` after the reset, then `step`."""
 
     def __init__(
         self,
@@ -291,9 +291,10 @@ _WITHIN = 1.0 - 1e-9
 def accept_goal(
     runner: EpisodeRunner, topic: TopicSpec, message: Any, *, reads_header: bool = True
 ) -> None:
-    """Replace the goal of the running episode from the next tick on; ValueError if it is invalid.
+    """Replace the goal of the running episode from the next tick on.
 
-    `reads_header=False` ignores frame and stamp, as robots of interface version 1 did.
+    `reads_header=False` ignores frame and stamp, as robots of interface version 1 did. ValueError
+    without a running episode, or if the frame, the stamp or the goal in `message` is invalid.
     """
     if runner.is_between_episodes:
         raise ValueError('no episode is running')
@@ -309,7 +310,7 @@ def accept_goal(
 
 
 def _check_stamp(runner: EpisodeRunner, stamp_ns: int) -> None:
-    """Raise ValueError for a goal's stamp outside of the running episode; 0 is always valid."""
+    """Raise ValueError unless a goal's stamp, ns, is 0 or lies in the running episode until now."""
     first, last = runner.current.first_stamp_ns, runner.stamp_ns
     if stamp_ns and not first <= stamp_ns <= last:
         raise ValueError(
@@ -332,10 +333,10 @@ def bounded_wrench(wrench: Array, limit: float) -> Array:
 def accept_perturbation(
     runner: EpisodeRunner, topic: TopicSpec, message: Any, limit: float
 ) -> None:
-    """Push the body that `message.header.frame_id` names, during the next tick.
+    """Push the body `message.header.frame_id` with the wrench of `message` in the next step.
 
-    `limit` is the largest force, N; the largest torque is 0.1 m times `limit`. ValueError beyond
-    these, without a running episode, or for a body that cannot move.
+    `limit` is the largest force, N, or 0 for no pushes; the largest torque is 0.1 m times `limit`.
+    ValueError beyond these, without a running episode, or for a body that cannot move.
     """
     if not limit:
         raise ValueError('perturbations are off; perturb_limit:=10.0 at the start allows 10 N')

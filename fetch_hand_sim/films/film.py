@@ -35,7 +35,7 @@ _PALETTE_SAMPLES = 8
 
 
 class Roll:
-    """A list of pictures (height, width, 3) uint8 of one size with lossless compression."""
+    """A list of pictures (height, width, 3) of one size, uint8, losslessly compressed in memory."""
 
     def __init__(self) -> None:
         self._file = BytesIO()
@@ -59,7 +59,7 @@ class Roll:
         return np.asarray(image)
 
     def open(self) -> Image.Image:
-        """Return all pictures as the frames of one Pillow image."""
+        """Return a Pillow image whose frames are the pictures; each is decoded when needed."""
         return Image.open(self._file)
 
 
@@ -79,7 +79,7 @@ def check_kind(path: Path) -> None:
 
 
 def check_size(path: Path, width: int, height: int) -> None:
-    """Raise ValueError if a side exceeds the limit of the file format, or the area 2^28 pixels."""
+    """Raise ValueError if a side is too long for the file format or the area over 2^28 pixels."""
     kind = path.suffix.lower()
     largest = _LARGEST_SIDE.get(kind)
     if largest is not None and max(width, height) > largest:
@@ -119,7 +119,7 @@ def write_picture(path: Path, picture: Picture) -> None:
 def write_animation(
     target: Path | IO[bytes], pictures: Iterable[Picture], fps: float, kind: str
 ) -> None:
-    """Write pictures (height, width, 3) of one size as `.gif` or `.webp`; see `write_film`."""
+    """Write pictures (height, width, 3) as `kind`, `.gif` or `.webp`; `fps` as in `write_film`."""
     every, roll, count = math.ceil(fps * _SHORTEST_MS / 1000.0), Roll(), 0
     for count, picture in enumerate(pictures, start=1):
         if (count - 1) % every == 0:
@@ -138,7 +138,7 @@ def write_animation(
 
 
 def _with_one_palette(roll: Roll) -> Iterator[Image.Image]:
-    """Yield the pictures with one common palette, because separate palettes flicker."""
+    """Yield the pictures as palette images with one common palette; separate palettes flicker."""
     some = range(0, len(roll), max(1, len(roll) // _PALETTE_SAMPLES))
     samples = Image.fromarray(np.concatenate([roll.picture(number) for number in some]))
     palette = samples.quantize(_GIF_COLORS)
@@ -189,7 +189,7 @@ def _ffmpeg() -> str:
 
 @contextmanager
 def _appearing(path: Path) -> Iterator[Path]:
-    """Yield the path of a temporary hidden file, which is renamed to `path` on success."""
+    """Yield the path of a hidden file, which is renamed to `path` on success and else removed."""
     # Follow a link, so that it stays a link.
     target = path.resolve()
     # The process id keeps two processes apart that write the same film.

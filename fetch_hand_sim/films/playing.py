@@ -58,7 +58,7 @@ class Film:
     def of_episode(
         cls, path: str | Path, width: int = 640, height: int = 480, camera: str | None = None
     ) -> Film:
-        """Draw a logged episode, or the first episode of a folder.
+        """Return the film of a logged episode, or of the first episode in a folder.
 
         Args:
             path: An episode file, its folder, or a folder of several episodes.

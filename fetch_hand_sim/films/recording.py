@@ -23,7 +23,7 @@ from msgs_spec.tasks import TaskSpec
 
 @dataclass(frozen=True, slots=True)
 class Recording:
-    """An episode of N steps that can be drawn: N + 1 frames and their times (N + 1,), s from 0."""
+    """An episode of N steps as N + 1 frames; `times` (N + 1,) are simulated s since the reset."""
 
     arrays: EpisodeArrays
     frames: list[Frame]
@@ -37,17 +37,17 @@ class Recording:
 
     @property
     def metric(self) -> GoalMetric:
-        """The goal metric of the task with the success rule of the episode."""
+        """The goal metric of the task, with the episode's success rule and sparse rewards."""
         return GoalMetric(self.spec, success_rule=self.arrays.record.success_rule)
 
 
 def load_recording(path: Path) -> Recording:
-    """Read an episode file as frames."""
+    """Read a bag directory or MCAP file as frames; EpisodeReadError if it is no valid episode."""
     return recording_of(load_episode(path))
 
 
 def recording_of(arrays: EpisodeArrays) -> Recording:
-    """Make frames of a loaded episode; reads joint positions and object poses from its file."""
+    """Return a loaded episode as frames; read joint and object positions from its file again."""
     task, stamps = arrays.record.task, arrays.stamps
     file, poses = read_episode(arrays.path), None
     with one_line_errors(file.path):
@@ -72,10 +72,10 @@ def recording_of(arrays: EpisodeArrays) -> Recording:
 def load_recordings(
     path: Path, count: int, on_skip: Callable[[EpisodeReadError], None] | None = None
 ) -> list[Recording]:
-    """Read the first `count` readable episodes of a file or folder.
+    """Read up to `count` readable episodes of a file or folder, in the order of their names.
 
     Args:
-        on_skip: Called with the error of each skipped episode; None raises the first error.
+        on_skip: Called at the end with the error of each skipped episode; None raises the first.
 
     Raises:
         EpisodeReadError: If no episode is readable; `on_skip` is not called then.
@@ -92,7 +92,7 @@ def load_recordings(
 
 
 def none_readable(errors: Sequence[EpisodeReadError]) -> EpisodeReadError:
-    """Return one error that stands for all errors of several unreadable episodes."""
+    """Return the only one of `errors`, or an error with their number and the first message."""
     first, *others = errors
     if not others:
         return first
@@ -100,7 +100,7 @@ def none_readable(errors: Sequence[EpisodeReadError]) -> EpisodeReadError:
 
 
 def find_playable(path: Path) -> list[Path]:
-    """Return the paths of the episodes in a file or folder, sorted; EpisodeReadError if none."""
+    """Return `path`, or the sorted episodes in this folder; EpisodeReadError if it has none."""
     paths = expand_episodes(path)
     if not paths:
         raise holds_no_episode(path)
@@ -116,10 +116,11 @@ _SAME_TIME = 1e-6
 
 
 class Studio:
-    """Draws recordings of any tasks as pictures of one size.
+    """Draws recordings of any tasks as pictures of `width` x `height` pixels.
 
-    Methods that draw raise ValueError if the frame or the camera does not exist, and RuntimeError
-    without OpenGL.
+    `camera` is the name of a camera of the models; None is the default view of each task. Methods
+    that draw raise ValueError if the frame or the camera does not exist, and RuntimeError without
+    OpenGL.
     """
 
     def __init__(self, width: int, height: int, camera: str | None = None) -> None:
@@ -128,24 +129,24 @@ class Studio:
         self._renderers: dict[str, SceneRenderer] = {}
 
     def pictures(self, recording: Recording) -> Iterator[Picture]:
-        """Yield the picture (height, width, 3) of every frame."""
+        """Yield the result of `picture` for every frame, in order."""
         for index in range(len(recording.frames)):
             yield self.picture(recording, index)
 
     def picture(self, recording: Recording, index: int) -> Picture:
-        """Return the picture of one frame; negative indices count from the end."""
+        """Return the picture of a frame with goal and trail; -1 is the last frame."""
         frames, index = recording.frames, self._index(recording, index)
         renderer = self._renderer(recording.spec.name)
         return renderer.render(frames[index], trail_of(frames, index))
 
     def plain(self, recording: Recording, index: int) -> Picture:
-        """Return the picture of one frame for data sets, without trail and success colour."""
+        """Return the picture of a frame for data sets, which shows neither trail nor success."""
         frame = recording.frames[self._index(recording, index)]
         frame = replace(frame, is_success=False)
         return self._renderer(recording.spec.name).render(frame, [])
 
     def framed(self, recording: Recording, index: int) -> Picture:
-        """Return the picture of one frame, with a green edge if the goal is reached."""
+        """Return the result of `picture`, with a green edge if this frame reaches the goal."""
         picture = self.picture(recording, index)
         return with_edge(picture) if recording.frames[index].is_success else picture
 
@@ -170,13 +171,13 @@ class Studio:
 
 
 def sheet_size(count: int, columns: int, width: int, height: int) -> tuple[int, int]:
-    """Return width and height, pixels, of the sheet that `tile` makes of `count` pictures."""
+    """Return width and height of the sheet that `tile` makes of `count` pictures, all in pixels."""
     rows = -(-count // columns)
     return columns * (width + _GAP) - _GAP, rows * (height + _GAP) - _GAP
 
 
 def tile(pictures: Sequence[Picture], columns: int) -> Picture:
-    """Join pictures of one size to one sheet, row by row; empty places are white."""
+    """Join one or more pictures of equal size to a sheet, row by row; gaps are white."""
     height, width = pictures[0].shape[:2]
     total_width, total_height = sheet_size(len(pictures), columns, width, height)
     sheet = np.full((total_height, total_width, 3), 255, dtype=np.uint8)
@@ -189,9 +190,10 @@ def tile(pictures: Sequence[Picture], columns: int) -> Picture:
 def grid(
     studio: Studio, recordings: Sequence[Recording], columns: int, hz: float
 ) -> Iterator[Picture]:
-    """Yield sheets, `hz` per simulated second, with all recordings side by side at equal times.
+    """Yield `hz` sheets per simulated second until the longest recording ends.
 
-    A recording that has ended shows its last frame.
+    A sheet shows all recordings at the same time after their resets. A recording that has ended
+    shows its last frame. A green edge marks a reached goal.
     """
     shown = [-1] * len(recordings)
     pictures: list[Picture] = [np.zeros(0, np.uint8)] * len(recordings)
@@ -205,13 +207,13 @@ def grid(
 
 
 def sheets(recordings: Sequence[Recording], hz: float) -> int:
-    """Return the number of sheets that `grid` yields until the longest recording ends."""
+    """Return the number of sheets that `grid` yields."""
     longest = max(float(recording.times[-1]) for recording in recordings)
     return 1 + math.ceil(longest * hz - _SAME_TIME)
 
 
 def with_edge(picture: Picture) -> Picture:
-    """Return a copy of the picture with a green edge."""
+    """Return a copy of the picture whose outer pixels are a green edge."""
     framed = picture.copy()
     for edge in (np.s_[:_EDGE], np.s_[-_EDGE:], np.s_[:, :_EDGE], np.s_[:, -_EDGE:]):
         framed[edge] = _REACHED

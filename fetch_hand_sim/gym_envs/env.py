@@ -23,15 +23,13 @@ class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32
     """One task with dictionary observations, for hindsight experience replay.
 
     Episodes never terminate; `gymnasium.make` truncates them after the task's number of steps.
-    `gymnasium.make` also takes the arguments of this class. Copies by `pickle` or `copy` have
-    their own physics and continue from the same state, bit for bit.
+    The arguments are those of `TaskAttributes`, also for `gymnasium.make`. Copies by `pickle` or
+    `copy` have their own physics and continue from the same state, bit for bit.
 
     A subclass may override these methods of Gymnasium-Robotics, or a user may set them on the
     object: `_sample_goal()`, `_get_obs()`, `_is_success(achieved_goal, desired_goal)`, and
     `compute_terminated`, `compute_truncated` and `compute_reward` (achieved_goal, desired_goal,
     info). `reset` and `step` then call them in the order of Gymnasium-Robotics.
-
-    The arguments are those of `TaskAttributes`.
 
     Raises:
         ValueError: If an argument is not allowed.
@@ -140,12 +138,12 @@ class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32
 
     @property
     def model(self) -> Any:
-        """The compiled `mujoco.MjModel`; changes take effect in the next call."""
+        """The compiled `mujoco.MjModel`; changes take effect in the environment's next call."""
         return self._physics.model
 
     @property
     def data(self) -> Any:
-        """The live `mujoco.MjData`; changes take effect in the next call."""
+        """The live `mujoco.MjData`; changes take effect in the environment's next call."""
         return self._physics.data
 
     @property
@@ -192,7 +190,7 @@ class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32
         return self.__dict__.copy()
 
     def _draws_goals(self) -> bool:
-        """Let the simulation draw goals if `_sample_goal` is not overridden; return True if so."""
+        """Return True, and let the simulation draw goals, unless `_sample_goal` is overridden."""
         draws_goals = not self.overrides('_sample_goal')
         self.simulation.task.draws_goals = draws_goals
         return draws_goals

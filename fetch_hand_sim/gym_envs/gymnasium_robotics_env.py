@@ -108,8 +108,8 @@ class RobotEnv(FetchHandEnv, GoalEnv):
     Attributes:
         n_substeps: Physics steps per action.
         initial_time: Simulated time at which episodes start, s.
-        initial_qpos: Joint positions at the start of an episode, before random draws; read-only.
-        initial_qvel: Joint velocities at the start of an episode; read-only.
+        initial_qpos: `qpos` (nq,) at the start of an episode, before random draws; read-only.
+        initial_qvel: `qvel` (nv,) at the start of an episode; read-only.
         fullpath: The MJCF file.
     """
 
@@ -218,7 +218,7 @@ class RobotEnv(FetchHandEnv, GoalEnv):
 
     @property
     def data(self) -> Any:
-        """The `mujoco.MjData`, with markers at the goal; changes take effect in the next call."""
+        """The `mujoco.MjData`, with markers at the goal; the next method call applies changes."""
         data = super().data
         self._show_goal()
         return data
@@ -429,7 +429,7 @@ class ManipulateEnv(RobotEnv):
 
 
 def make_env(task: str, **arguments: Any) -> RobotEnv:
-    """Make the environment of a task; `arguments` are those of its class, such as `FetchEnv`."""
+    """Return an environment of a task; `arguments` are those of its class, such as `FetchEnv`."""
     spec = task_spec(task)
     if task in FETCH_CONFIGS:
         return FetchEnv(task, **arguments)
@@ -448,15 +448,16 @@ def _sites(model: mujoco.MjModel, prefix: str) -> list[int]:
 
 
 def _goal_kind(task: str) -> tuple[str, str]:
-    """Return `target_position` and `target_rotation` of a task, as in Gymnasium-Robotics."""
+    """Return `target_position` and `target_rotation` of a task, such as ('ignore', 'xyz')."""
     position = 'random' if task_spec(task).position_counts else 'ignore'
     return position, MANIPULATE_CONFIGS[task].target_rotation
 
 
 def task_with_goals(task: str, position: str | None, rotation: str | None) -> str:
-    """Return the task with the object of `task` and goals of this position and rotation kind.
+    """Return the name of the task with the object of `task` and the given kinds of goals.
 
-    None keeps the kind of `task`. A combination without a task raises ValueError.
+    `position` and `rotation` are `target_position` and `target_rotation` of `ManipulateEnv`; None
+    keeps those of `task`. A combination without a task raises ValueError.
     """
     one_of(task, list(MANIPULATE_CONFIGS), 'task')
     own, asset = _goal_kind(task), MANIPULATE_CONFIGS[task].asset

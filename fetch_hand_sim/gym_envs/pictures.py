@@ -32,8 +32,9 @@ RENDER_MODES = ['human', 'rgb_array', 'depth_array']
 class Pictures:
     """Renders the robots of a batch; opens OpenGL or a window at the first picture.
 
-    The constructor raises ValueError for an invalid size (pixels) or camera attribute. `render`
-    raises RuntimeError if OpenGL is missing or, in mode `human`, if the display is missing.
+    `camera` contains attributes of `mujoco.MjvCamera` by name. The constructor raises ValueError
+    for an invalid attribute or size (pixels). `render` raises RuntimeError if OpenGL is missing or,
+    in mode `human`, if the display is missing.
     """
 
     def __init__(
@@ -53,10 +54,10 @@ class Pictures:
         self._window: Any = None
 
     def render(self, mode: str, index: int = 0) -> Image | None:
-        """Render robot `index` of the batch.
+        """Return a picture of robot `index` of the batch, in one of the `RENDER_MODES`.
 
-        Returns:
-            `rgb_array`: (height, width, 3). `depth_array`: (height, width), metres. `human`: None.
+        `depth_array` returns distances from the camera plane (height, width), m. `human` shows the
+        picture in a window and returns None.
         """
         if self._scene is None:
             self._scene = Scene(self._simulation.spec.name)
@@ -80,7 +81,7 @@ class Pictures:
         self._renderer = self._window = None
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the state for `pickle` without OpenGL objects; a copy opens its own."""
+        """Return the state for `pickle` without OpenGL objects; an unpickled copy opens its own."""
         return self.__dict__ | {'_scene': None, '_renderer': None, '_window': None}
 
     def _show(self, scene: Scene, frame: Frame) -> None:

@@ -38,7 +38,7 @@ def register_environments() -> None:
 
 
 def _register(name: str, entry_point: str, vector_entry_point: str, **arguments: str) -> None:
-    """Register the classes of a single and a vector environment, with `arguments`, under an id."""
+    """Register single and vector environment under the id `name`, with constructor `arguments`."""
     gymnasium.register(
         name,
         entry_point=entry_point,
@@ -61,7 +61,7 @@ def make(name: str | EnvSpec, **arguments: Any) -> gymnasium.Env[Any, Any]:
             `render_mode` and `control_hz`.
 
     Raises:
-        ValueError: If an argument is not allowed.
+        ValueError: If the value of an argument is not allowed.
         gymnasium.error.NameNotFound: If there is no such task or id.
     """
     name = _id_of(name)
@@ -193,7 +193,7 @@ def register_gymnasium_robotics(override: bool = False) -> None:
 
     Args:
         override: Whether to replace ids that another package has registered. If True, this
-            function first imports Gymnasium-Robotics, so that a later import changes nothing.
+            function first imports Gymnasium-Robotics. A later import then registers no ids again.
 
     Raises:
         gymnasium.error.Error: If another package has registered one of the ids and `override` is

@@ -22,10 +22,8 @@ class FetchHandVecEnv(VecEnv):
 
     It behaves as a `DummyVecEnv` of N single environments: the step that ends an episode starts
     the next one, and `info['terminal_observation']` is the last observation. Wrap it in a
-    `VecMonitor` for the returns of episodes.
-
-    Args:
-        **arguments: Arguments of `FetchHandVectorEnv` except `autoreset_mode`.
+    `VecMonitor` for the returns of episodes. `arguments` are those of `FetchHandVectorEnv` except
+    `autoreset_mode`.
     """
 
     def __init__(self, task: str, num_envs: int = 1, **arguments: Any) -> None:
@@ -42,7 +40,7 @@ class FetchHandVecEnv(VecEnv):
     def reset(self) -> Observation:
         """Start all episodes, with the seeds and options that `seed` and `set_options` set.
 
-        Options are `goal`, `variation` and `start`, as in `FetchHandEnv.reset`.
+        Both are used once. Options are `goal`, `variation` and `start`, as in `FetchHandEnv.reset`.
 
         Raises:
             ValueError: If an option is unknown or invalid. All options are cleared then.
@@ -61,7 +59,7 @@ class FetchHandVecEnv(VecEnv):
         self._actions = actions
 
     def step_wait(self) -> VecEnvStepReturn:
-        """Step all environments with the stored actions."""
+        """Step all environments with the stored actions; return what `VecEnv.step` returns."""
         assert self._actions is not None, 'step_async comes before step_wait'
         observation, reward, terminated, truncated, info = self.batch.step(self._actions)
         ended = terminated | truncated
@@ -83,7 +81,7 @@ class FetchHandVecEnv(VecEnv):
         self.batch.close()
 
     def get_images(self) -> Sequence[NDArray[np.uint8] | None]:
-        """Return a picture of every environment."""
+        """Return a picture of every environment; N times None without a render mode."""
         return self.batch.render() or [None] * self.num_envs
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
@@ -94,8 +92,8 @@ class FetchHandVecEnv(VecEnv):
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
         """Set `goal` of the environments in `indices`, or an attribute that all environments share.
 
-        Shared are `reward_type`, `distance_threshold` and `rotation_threshold`. A new value for
-        only some of the environments raises ValueError.
+        Shared are `reward_type`, `distance_threshold` and `rotation_threshold`. A new value of
+        these for only some of the environments raises ValueError.
         """
         values = list(self.batch.attributes(attr_name))
         for index in self._get_indices(indices):

@@ -104,7 +104,7 @@ class TaskAttributes:
             self.rotation_threshold = rotation_threshold
 
     def __setattr__(self, name: str, value: Any) -> None:
-        """Set an attribute; TypeError for a Gymnasium-Robotics method that is never called here."""
+        """Set an attribute; TypeError if it replaces a method that this class never calls."""
         if name in self._uncalled:
             raise TypeError(f'{name} would have no effect here; {self._hint}')
         super().__setattr__(name, value)
@@ -132,7 +132,7 @@ class TaskAttributes:
     def compute_reward(
         self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any = None
     ) -> Any:
-        """Return rewards (...) of goals of any batch shape (..., goal size).
+        """Return rewards (...) of goals (..., goal size) with any leading axes.
 
         If a subclass overrides this method, `step` returns its rewards.
         """
@@ -212,7 +212,7 @@ class TaskAttributes:
         """Return `goal`, `variation` and `start` for `Simulation.reset`, or raise ValueError.
 
         Args:
-            options: A dictionary or None. Each option is one value for all, or a list of N.
+            options: A dictionary or None. An option is one value for all environments or N values.
             mask: (N,) True for the environments that start. Each returned list has one entry for
                 each of these.
             others: Names of further allowed options, which the caller reads.
@@ -225,7 +225,7 @@ class TaskAttributes:
 
 
 def observation_space(spec: TaskSpec) -> spaces.Space[Any]:
-    """Return the unbounded float64 space of observations, a dictionary of three parts."""
+    """Return the dictionary space of observation, achieved and desired goal, float64, unbounded."""
     sizes = {'observation': spec.observation_size}
     sizes |= dict.fromkeys(('achieved_goal', 'desired_goal'), spec.goal.size)
     return spaces.Dict(

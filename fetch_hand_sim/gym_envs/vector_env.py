@@ -42,7 +42,6 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
     use `fetch_hand_sim.make_vec`.
 
     Args:
-        task: One of the tasks (`msgs_spec.tasks.TASKS`).
         num_envs: Number of copies N.
         max_episode_steps: Steps per episode; None for the task's own number, -1 for no limit.
         num_threads: Threads that step the copies; 0 for all processors that the process may use.
@@ -51,7 +50,7 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
 
     Raises:
         ValueError: If an argument is not allowed.
-        TypeError: If a subclass overrides a method that only `FetchHandEnv` calls.
+        TypeError: If a subclass overrides `_get_obs`, `_is_success` or `_sample_goal`.
     """
 
     metadata = {  # noqa: RUF012 - as in gymnasium.vector.VectorEnv
@@ -111,8 +110,7 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
                 each of N, where None means a random value.
 
         Returns:
-            The observations of all environments, in the order of the space, and an empty
-            dictionary.
+            The observations of all N environments, and an empty dictionary.
 
         Raises:
             ValueError: If an option is unknown, a mask, goal or seed is invalid, or the number of
@@ -149,10 +147,11 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
         Returns:
             Observations (N, ...), rewards (N,), terminated (N,), truncated (N,) and a dictionary.
             Terminated is False unless a subclass overrides `compute_terminated`. Truncated is True
-            at the last step and if MuJoCo diverged. The dictionary has `is_success` and `diverged`
-            (N,); the masks `_is_success` and `_diverged` are False where this step started an
-            episode. In mode `SAME_STEP` the dictionary also has `final_obs` (N,), a dictionary for
-            each ended episode, and `final_info`: `is_success` and `diverged` of ended episodes.
+            at the last step, if MuJoCo diverged, and where `compute_truncated` returns True. The
+            dictionary has `is_success` and `diverged` (N,). Their masks `_is_success` and
+            `_diverged` are False where this step started an episode. In mode `SAME_STEP` it also
+            has `final_obs` (N,), a dictionary for each ended episode, and `final_info`, the
+            `is_success` and `diverged` of ended episodes.
 
         Raises:
             ValueError: If the actions have a wrong shape, a value is NaN, or an overridden method
@@ -205,7 +204,7 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
         return np.asarray(self.compute_reward(*_evaluated(result)), dtype=np.float64)
 
     def _endings(self, name: str, result: StepResult) -> Flags:
-        """Return which episodes the method `name` ends, (N,); none if it is not overridden."""
+        """Return a mask (N,) of episodes that method `name` ends; all False if not overridden."""
         if not self.overrides(name):
             return np.zeros(self.num_envs, dtype=bool)
         ends = getattr(self, name)(*_evaluated(result))
@@ -220,7 +219,10 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
     def _start_next(
         self, last: Observation, info: dict[str, Any], ended: Flags
     ) -> tuple[Observation, dict[str, Any]]:
-        """Reset `ended` (N,) environments; return N observations and `info` with `final_obs`."""
+        """Reset the environments of the mask `ended`; return observations and infos of all N.
+
+        For ended episodes, `last` becomes `final_obs` and `info` becomes `final_info`.
+        """
         final = np.full(self.num_envs, None, dtype=object)
         for index in np.flatnonzero(ended).tolist():
             final[index] = {name: rows[index] for name, rows in last.items()}
@@ -325,7 +327,7 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
         self._pictures.close()
 
     def _each_seed(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
-        """Return N seeds, drawn for environments that never had one; None continues a generator."""
+        """Return `seed` as N seeds; where there never was one, replace None by a random seed."""
         if seed is None:
             each: list[int | None] = [None] * self.num_envs
         elif np.ndim(seed):  # type: ignore[arg-type]
@@ -375,7 +377,7 @@ def _evaluated(result: StepResult) -> tuple[Array, Array, dict[str, Any]]:
 
 
 def _masked(values: Mapping[str, Any], mask: Flags) -> dict[str, Any]:
-    """Return the values (N,) with a mask `_<name>` for each, the format of Gymnasium's infos."""
+    """Return `values`, and for each a copy of `mask` as `_<name>`, as in Gymnasium's infos."""
     return {**values, **{f'_{name}': mask.copy() for name in values}}
 
 

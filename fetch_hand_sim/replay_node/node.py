@@ -36,7 +36,7 @@ _CLOCK = '/clock'
 
 
 class ReplayNode(Node):
-    """Publishes a logged episode, once or in a loop."""
+    """Publishes a logged episode, with the settings `msgs_spec.parameters.REPLAY_NODE`."""
 
     def __init__(self) -> None:
         super().__init__(NODE_NAME, start_parameter_services=False)
@@ -80,9 +80,10 @@ class ReplayNode(Node):
         return open_publisher(self, replace(spec, name=self._name_here(name)))
 
     def _name_here(self, name: str) -> str:
-        """Return a topic name with this node's namespace in place of the recorded one.
+        """Return a recorded topic name with this node's namespace in place of the recorded one.
 
-        `/clock` and other names outside it stay; all names stay if this node has no namespace.
+        `/clock` and names outside the recorded namespace are returned unchanged. If this node has
+        no namespace, all names are returned unchanged.
         """
         namespace, recorded = self.get_namespace().rstrip('/'), f'{self._schedule.namespace}/'
         if not namespace or name == _CLOCK or not name.startswith(recorded):
@@ -90,7 +91,10 @@ class ReplayNode(Node):
         return f'{namespace}/{name.removeprefix(recorded)}'
 
     def run(self, stop: StopSignals) -> None:
-        """Publish until the end or a signal; UsageError if a topic has another publisher."""
+        """Publish until a signal arrives or, unless the setting `loop` is on, the episode ends.
+
+        Raise UsageError if a topic has another publisher and the setting `force` is off.
+        """
         loop = EventLoop(self)
         self.get_logger().info(self._description())
         try:
@@ -105,7 +109,7 @@ class ReplayNode(Node):
             loop.close()
 
     def _require_free_topics(self, loop: EventLoop, stop: StopSignals) -> None:
-        """Raise UsageError if a topic has another publisher, unless `force` is set."""
+        """Wait for discovery; UsageError if a topic has another publisher and `force` is off."""
         if self._settings['force']:
             return
         while not stop and time.monotonic() < self._created_at + DISCOVERY_TIME:
@@ -127,7 +131,7 @@ class ReplayNode(Node):
                 )
 
     def _description(self) -> str:
-        """Return a log line with the episode, its pace and the namespace of the topics."""
+        """Return a log line with the episode, the speed and the namespace of the topics."""
         seconds = (self._schedule.end_ns - self._start_ns) / 1e9
         parts = [
             f'{self._settings["path"]}: {seconds:.2f} s, at {self._settings["rate"]:g} x real time',
@@ -142,7 +146,8 @@ class ReplayNode(Node):
     def _wait_for_commander(self, loop: EventLoop, stop: StopSignals) -> None:
         """Publish the latched topics; with `wait_for_commands`, wait until a policy is connected.
 
-        A policy reads its task from them; without the wait, it would miss the first observation.
+        A policy node connects after it has read its task from the latched topics. Without the
+        wait, it would miss the first observation.
         """
         self._publish_latched()
         if not self._settings['wait_for_commands']:
@@ -175,7 +180,7 @@ class ReplayNode(Node):
         return False
 
     def _serve(self, loop: EventLoop) -> None:
-        """Serve callbacks until a message is due, up to 0.1 s; if paused, resend `/clock`."""
+        """Serve callbacks until a message is due, at most 0.1 s; if paused, resend `/clock`."""
         messages = self._schedule.messages
         due = messages[self._next].time_ns if self._next < len(messages) else self._end_ns
         remaining = self._playhead.remaining(due, time.monotonic())

@@ -31,10 +31,9 @@ class ReplayMessage:
 
 
 class ReplaySchedule:
-    """The messages of an episode to publish, sorted by log time.
+    """The messages of an episode to publish; `messages` is sorted by log time.
 
     Args:
-        path: The episode.
         topics: Topics to publish; empty for all topics that the robot published.
         with_inputs: Whether to publish also the commands and goals that the robot received, if
             `topics` is empty.
@@ -106,9 +105,10 @@ def _require_names(names: Iterable[str]) -> None:
 
 
 class Playhead:
-    """Computes the current position of a replay, a log time.
+    """Computes the position of a replay, a log time, which grows with wall-clock time.
 
-    `now` is the time of any steady clock, s. `rate` is simulated seconds per second; 0 pauses.
+    It is `position_ns` at the first `now`; each `now` is a time, s, of one steady clock. `rate` is
+    simulated seconds per second; 0 pauses.
     """
 
     def __init__(self, position_ns: int, rate: float, now: float) -> None:

@@ -52,7 +52,7 @@ class InputWatch:
         return sorted(name for name, count in copies.items() for _ in range(count))
 
     def update(self, found: Iterable[Endpoint], now: float) -> bool:
-        """Replace the known publishers; return whether a publisher of commands is new."""
+        """Store the publishers found at time `now`, s; return if a publisher of commands is new."""
         known = self._since
         self._endpoints, self._now = list(found), now
         self._since = {each.gid: known.get(each.gid, now) for each in self._endpoints}
@@ -84,7 +84,7 @@ class InputWatch:
         return len(ages) if ages and min(ages) > MEMORY_OF_THE_GRAPH else min(len(ages), 1)
 
     def _mismatch(self, endpoint: Endpoint) -> str:
-        """Return why the robot cannot receive from a publisher; '' if it can."""
+        """Return why the robot cannot receive from a publisher (its type or reliability), or ''."""
         allowed = self.types[endpoint.topic]
         if endpoint.type_name != allowed:
             return f'its type is {endpoint.type_name}; allowed: {allowed}'

@@ -81,7 +81,7 @@ class Health:
         return self._recorder is not None and self._recorder.has_failed
 
     def messages(self, now: float) -> Messages:
-        """Return messages: report and real-time factor since the last call. Log new problems."""
+        """Return the encoded report and real-time factor since the last call; log new problems."""
         report = self.report(now)
         self._log_news()
         factor = self._factor_codec.encode(0, [self._real_time_factor])
@@ -119,7 +119,7 @@ class Health:
         return report
 
     def _passing_problems(self, grown: Mapping[str, int], seconds: float) -> Iterator[Problem]:
-        """Yield problems of the last `seconds`; `grown` is the increase of each counter."""
+        """Yield problems of the last `seconds`; `grown` is the increase by counter name."""
         robot = self._robot
         schedule, buffer = robot.schedule, robot.buffer
         asked = schedule.asked_rate if robot.runner.has_started else None

@@ -78,7 +78,7 @@ class SimNode(Node):
     # Set-up
 
     def _reject_simulated_time(self) -> None:
-        """Set `use_sim_time` back to false, which some launch files set to true for all nodes."""
+        """Set `use_sim_time` back to false, with a warning; launch files may set it to true."""
         if self.get_parameter('use_sim_time').value:
             self.set_parameters([Parameter('use_sim_time', value=False)])
             self.get_logger().warning(
@@ -207,7 +207,7 @@ class SimNode(Node):
         )
 
     def _wait_for_commander(self, loop: EventLoop, stop: StopSignals) -> None:
-        """Wait until a policy is connected and publishes commands, or a service runs a tick."""
+        """Wait until a commander is connected, a service starts the episode or a signal arrives."""
         watch = self._watch
         while not (watch.inputs.commanders and watch.are_subscribers_connected()):
             if stop or self._robot.runner.has_started:
@@ -225,9 +225,9 @@ class SimNode(Node):
             loop.wait(BEAT)
 
     def _serve_until_due(self, loop: EventLoop, stop: StopSignals) -> None:
-        """Run the tick if it is due; otherwise wait at most `BEAT` seconds for a callback.
+        """Run the tick if it is due; otherwise wait at most `BEAT` s for a callback and run it.
 
-        One received callback runs. In real time, callbacks that already wait run before the tick.
+        Except in lockstep, callbacks that already wait run before the tick.
         """
         remaining = self._robot.wait()
         if remaining > 0.0:
@@ -242,9 +242,9 @@ class SimNode(Node):
             self._ticked_at = time.monotonic()
 
     def _beat_when_due(self) -> None:
-        """Every `BEAT` seconds, publish `latest_tick`; when due, check the ROS graph and report.
+        """Publish `latest_tick` every `BEAT` seconds; check the ROS graph every second.
 
-        If a tick is due within 10 ms, the tick runs first. The report is published as diagnostics.
+        Every second, also publish diagnostics. If a tick is due within 10 ms, the tick runs first.
         """
         now = time.monotonic()
         if now < self._beat_due or (
@@ -262,9 +262,9 @@ class SimNode(Node):
             self._publish(self._health.messages(now))
 
     def _stand_still(self, now: float) -> None:
-        """While no tick runs, repeat the last tick for new subscribers; warn of a missing command.
+        """Repeat the last tick for new subscribers while no tick runs; log missing commands.
 
-        While paused or before the first tick, publish `/clock`, too.
+        While paused or before the first tick, also publish `/clock`. `now` is monotonic time, s.
         """
         robot, watch = self._robot, self._watch
         has_started = robot.runner.has_started

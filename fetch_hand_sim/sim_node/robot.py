@@ -42,7 +42,7 @@ class Counters:
     Attributes:
         ticks: Published ticks, resets included.
         ended_early: Episodes that a reset ended early.
-        late_commands: Steps in real time without the command that answers the last tick.
+        late_commands: Steps in real time that began without the command for the last tick.
         tick_time: Wall-clock time of ticks: physics, encoding, publishing and logging.
     """
 
@@ -62,7 +62,7 @@ class Robot:
 
     Attributes:
         perturb_limit: Largest force of a push, N; 0 rejects all pushes.
-        has_commander: True once the node has waited for a policy; ticks then expect commands.
+        has_commander: True once the node has waited for a policy, so that commands are expected.
         last_messages: Messages of the last tick, which are repeated for new subscribers.
     """
 
@@ -103,7 +103,7 @@ class Robot:
 
     @property
     def is_reset_due(self) -> bool:
-        """True if a paused or waiting robot must now run the reset that a service requested."""
+        """True if a reset, which a service requested in lockstep or a pause, must run now."""
         return self._reset_due is not None and self._reset_due <= self._clock()
 
     @property
@@ -126,8 +126,8 @@ class Robot:
     def lacks_answer(self) -> bool:
         """True if the command computed from the last tick is expected but has not arrived.
 
-        This applies in real time while commands arrive. A command that names no observation counts
-        as the answer to the tick before it.
+        Always False in lockstep, in a pause, between episodes and after commands have stopped. A
+        command that names no observation counts as computed from the last tick.
         """
         if self.schedule.mode == 'lockstep' or self.schedule.is_paused:
             return False
@@ -173,19 +173,19 @@ class Robot:
     # Messages without a tick
 
     def waiting_status(self) -> Messages:
-        """Return the `/clock` and `episode_status` messages of a robot that has not started."""
+        """Return the `/clock` and `episode_status` messages to publish before the first tick."""
         stamp_ns = self.runner.stamp_ns
         status = self._encoder.encode_status(stamp_ns, self.runner.waiting_status())
         return [self.clock_message(), status]
 
     def clock_message(self) -> tuple[TopicSpec, bytes]:
-        """Return the `/clock` message with the present simulated time."""
+        """Return `/clock` and its message (CDR bytes) with the present simulated time."""
         return self._encoder.encode_clock(self.runner.stamp_ns)
 
     # Received messages
 
     def set_goal(self, topic: TopicSpec, message: Any) -> None:
-        """Replace the goal of the running episode from the next tick on; ValueError if invalid."""
+        """Replace the goal from the next tick on; ValueError if invalid or between episodes."""
         try:
             accept_goal(self.runner, topic, message)
         except ValueError as error:
@@ -203,7 +203,7 @@ class Robot:
     def reset(self, *, to_first_episode: bool = False) -> Answer:
         """End the running episode; the next tick starts the next or (`to_first_episode`) the first.
 
-        A paused or waiting robot runs this tick without a command. `success` is always True.
+        In lockstep or a pause, this tick runs without a command. `success` is always True.
         """
         runner = self.runner
         episode, was_running = runner.episode, not runner.is_between_episodes
@@ -224,16 +224,17 @@ class Robot:
         return Answer(True, f'{ends}; a tick of its own {starts}')
 
     def _silence_begins(self) -> float:
-        """Return the monotonic time, s, at which a requested reset of a waiting robot may run.
+        """Return the time, s of the robot's clock, from which a requested reset may run.
 
-        By then the command for the last tick has arrived or timed out. A command that arrived after
-        the reset would count as the answer to it, and all later commands would be one tick late.
+        In a pause, or if the command for the last tick has arrived, this is now. Otherwise it is
+        0.2 s after that tick. A command that arrived after the reset would count as the answer to
+        the reset, and all later commands would be one tick late.
         """
         is_answered = self.schedule.is_paused or self.buffer.has_fresh_command
         return self._clock() if is_answered else self._ticked_at + _ANSWER_TIME
 
     def pause(self, paused: bool) -> Answer:
-        """Pause or resume ticks and simulated time."""
+        """Pause or resume ticks and simulated time; `success` is always True."""
         if paused == self.schedule.is_paused:
             return Answer(True, 'already paused' if paused else 'already running')
         self.schedule.set_paused(paused, self._clock())
@@ -241,7 +242,10 @@ class Robot:
         return Answer(True, f'{"paused" if paused else "running"} at {self._now()}')
 
     def step(self, ticks: int = 1) -> Answer:
-        """Run ticks now; `success` is False in unpaused real time or if the episodes run out."""
+        """Run `ticks` ticks, 1 ... `MAX_STEPS`, now; `success` is False unless all have run.
+
+        In real time the robot must be paused. The episodes may run out before the last tick.
+        """
         if self.schedule.mode == 'realtime' and not self.schedule.is_paused:
             return Answer(False, 'a running simulation cannot be stepped; pause it first')
         if not 1 <= ticks <= MAX_STEPS:
@@ -253,7 +257,7 @@ class Robot:
         return Answer(True, f'{ticks} run, now at {self._now()}')
 
     def set_real_time_factor(self, factor: float) -> None:
-        """Set the simulated seconds per wall-clock second, from now on."""
+        """Set the simulated seconds per wall-clock second from now on; 0 is as fast as possible."""
         self.schedule.set_real_time_factor(factor, self._clock())
 
     def _now(self) -> str:
@@ -296,7 +300,7 @@ class Receivers:
         }
 
     def callback(self, spec: TopicSpec) -> Callable[[bytes], None]:
-        """Return the callback for a subscription that receives CDR bytes."""
+        """Return the callback, which takes CDR bytes, for a subscription to the topic `spec`."""
         handle = self._handlers[spec.name]
 
         def on_message(data: bytes) -> None:
@@ -317,7 +321,7 @@ class Receivers:
         return on_message
 
     def _read(self, spec: TopicSpec, data: bytes) -> Any:
-        """Decode a message; None, with a warning, if it is unreadable or too long."""
+        """Decode a message; None, with a warning, if it is unreadable or longer than 64 KiB."""
         try:
             require_short(data)
         except ValueError as error:

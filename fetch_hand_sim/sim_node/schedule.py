@@ -31,7 +31,7 @@ class TickSchedule:
     Attributes:
         changes: Number of pauses, resumptions and changes of the pace.
         missed_ticks: Deadlines that passed without a tick.
-        answer_wait: Longest delay of a tick, s, while no command answers the last tick.
+        answer_wait: Longest time, s, by which a tick waits for a command to answer the last one.
     """
 
     def __init__(
@@ -71,8 +71,8 @@ class TickSchedule:
     def wait(self, now: float, has_command: bool, lacks_answer: bool = False) -> float:
         """Return the seconds until the next tick; infinity while paused.
 
-        In lockstep it is 0 with a new command (`has_command`), and infinity without one. In real
-        time, `lacks_answer` (no command for the last tick yet) adds `answer_wait`.
+        In lockstep, return 0 with a new command (`has_command`), and infinity without one. In real
+        time, add `answer_wait` if `lacks_answer`: no command for the last tick has arrived yet.
         """
         if self.is_paused or (self.mode == 'lockstep' and not has_command):
             return math.inf
@@ -120,7 +120,7 @@ class TickSchedule:
 
 
 class LatestTick:
-    """Publishes `latest_tick`, all messages of the newest tick in one, at a limited rate."""
+    """Publishes all messages of the newest tick on `latest_tick`, at most 30 times a second."""
 
     def __init__(
         self, output: Publisher, encoder: TickEncoder, clock: Callable[[], float] = time.monotonic
@@ -138,11 +138,11 @@ class LatestTick:
         self.publish_when_due()
 
     def repeat(self) -> None:
-        """Mark the last tick as unpublished, so that new subscribers receive it."""
+        """Let `publish_when_due` publish the last tick once more, for new subscribers."""
         self._is_published = False
 
     def publish_when_due(self) -> None:
-        """Publish the newest tick if it is unpublished, due, and has subscribers."""
+        """Publish the newest tick if it is unpublished, has subscribers, and the rate allows."""
         now = self._clock()
         if self._latest is None or self._is_published or now < self._due:
             return

@@ -87,7 +87,7 @@ class SimulationInterfaces:
         return _finish(response, OK, '')
 
     def set_simulation_state(self, request: Any, response: Any) -> Any:
-        """Pause or resume the simulation."""
+        """Pause or resume the simulation; reject states other than playing and paused."""
         target = request.state.state
         if target not in (PLAYING, PAUSED):
             line = f'state {target} given; allowed: {PLAYING} (playing), {PAUSED} (paused)'
@@ -97,7 +97,7 @@ class SimulationInterfaces:
         return _finish(response, ALREADY_IN_TARGET_STATE if is_there else OK, answer.message)
 
     def reset_simulation(self, request: Any, response: Any) -> Any:
-        """End the episode; scope `state` starts the next one, scope `all` or default the first."""
+        """End the episode; start the next one (scope `state`) or the first (`all` or default)."""
         if request.scope not in (SCOPE_DEFAULT, SCOPE_STATE, SCOPE_ALL):
             line = f'scope {request.scope} given; allowed: {SCOPE_STATE} (state), '
             line += f'{SCOPE_DEFAULT} and {SCOPE_ALL} (all but time, which never goes back)'
@@ -109,7 +109,7 @@ class SimulationInterfaces:
         return _answer(response, Answer(answer.success, f'{answer.message}; time goes on'))
 
     def step_simulation(self, request: Any, response: Any) -> Any:
-        """Run the requested number of ticks; fail unless the simulation is paused."""
+        """Run the requested ticks, then answer; report failure unless the simulation is paused."""
         if not self._robot.schedule.is_paused:
             line = 'a simulation is stepped only while it is paused'
             return _finish(response, OPERATION_FAILED, line)

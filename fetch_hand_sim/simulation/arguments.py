@@ -1,4 +1,4 @@
-"""Checks of arguments, whose errors name the argument, the given value and the allowed ones."""
+"""Check arguments; an error names the argument, the given value and the allowed ones."""
 
 from __future__ import annotations
 
@@ -30,7 +30,10 @@ def require_whole(name: str, value: Any, lowest: int = 0, highest: int | None = 
 
 
 def finite_numbers(name: str, values: ArrayLike, *shapes: tuple[int, ...]) -> NDArray[np.floating]:
-    """Return finite numbers of one of `shapes` as float32 or float64, or raise ValueError."""
+    """Return finite numbers of one of `shapes` as an array, or raise ValueError.
+
+    A float32 array stays float32; other numbers become float64.
+    """
     try:
         array = np.asarray(values)
     except ValueError:
@@ -50,9 +53,9 @@ def finite_numbers(name: str, values: ArrayLike, *shapes: tuple[int, ...]) -> ND
 
 
 def nearest_quaternions(goals: Array, achieved_goals: Array) -> Array:
-    """Return goal poses (n, 7) with unit quaternions in the hemisphere of the achieved goals.
+    """Return goal poses (n, 7) with the unit quaternions that are nearest to the achieved goals.
 
-    Of q and -q, one is in this hemisphere. A zero goal quaternion raises ValueError.
+    Of q and -q, the same rotation, the nearer one is taken. A zero quaternion raises ValueError.
     """
     norm = np.linalg.norm(goals[:, 3:], axis=1, keepdims=True)
     if not (norm > 1e-6).all():
@@ -101,7 +104,7 @@ def selected_simulations(ids: ArrayLike, num_envs: int) -> NDArray[np.intp]:
 
 
 def generators(seed: Seeds, selected: NDArray[np.intp]) -> list[np.random.Generator | None]:
-    """Return a new random generator for each selected simulation, or None where no seed is given.
+    """Return a random generator for each selected simulation, or None where no seed is given.
 
     `seed` is one integer (simulation i takes `seed` + i), a list with an integer, a generator or
     None for each selected simulation, or None for all. Invalid seeds raise ValueError.
@@ -140,7 +143,7 @@ class StartState:
     velocities: dict[int, float] = field(default_factory=dict)
 
     def write(self, qpos: Array, qvel: Array) -> None:
-        """Write the values into `qpos` (nq,) and `qvel` (nv,) of one simulation."""
+        """Write the values into `qpos` (nq,) and `qvel` (nv,) of one simulation; keep others."""
         for row, values in ((qpos, self.positions), (qvel, self.velocities)):
             row[list(values)] = list(values.values())
 
@@ -151,10 +154,10 @@ def read_start(given: Any, task: Task) -> StartState:
     Joints and objects with a given position start at rest unless a velocity is given, too.
 
     Args:
-        given: A mapping with some of these entries. `joints` and `joint_velocities`: numbers by
-            joint name, or all in the order of `joint_states`, rad or m (/s). `object_pose`: (7,),
-            m and quaternion wxyz, world. `object_velocity`: (6,), linear m/s and angular rad/s,
-            world axes.
+        given: A mapping with some of these entries. `joints` (rad or m) and `joint_velocities`
+            (rad/s or m/s) are numbers by joint name, or all in the order of `joint_states`.
+            `object_pose` is (7,), m and quaternion wxyz, world. `object_velocity`, allowed only
+            with a pose, is (6,), linear m/s and angular rad/s, world axes.
     """
     parts, start = entries('start', given, PARTS), StartState()
     settled = task.new_data(task.start_state).qpos
@@ -178,7 +181,7 @@ def read_start(given: Any, task: Task) -> StartState:
 
 
 def _by_joint(part: str, parts: Mapping[str, Any], task: Task) -> dict[str, float]:
-    """Return the entry `part` of a start state as numbers by joint name, or raise ValueError."""
+    """Return the entry `part` by joint name, {} if missing; ValueError if it is invalid."""
     joints, given = task.spec.robot.joints, parts.get(part, {})
     if not isinstance(given, Mapping):
         values = finite_numbers(f'start {part}', given, (len(joints),))

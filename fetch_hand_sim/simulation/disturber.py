@@ -53,7 +53,8 @@ class Disturber:
     the episode, and do not change the draws of start and goal.
 
     Attributes:
-        variations: Values of the running episodes, (N,) each, by the names in `VARIATIONS`.
+        variations: Values in the running episodes, (N,) each, such as a factor on friction or a
+            latency in ticks, by the names in `VARIATIONS`.
     """
 
     def __init__(self, task: Task, disturbances: Disturbances) -> None:
@@ -116,10 +117,9 @@ class Disturber:
     # Episodes
 
     def allow(self, given: Mapping[str, Any]) -> dict[str, float]:
-        """Check variations that a user sets for an episode and prepare the model for them.
+        """Check variations that a user sets for an episode; return their values by name.
 
-        Returns:
-            The values as numbers, by name.
+        To vary physics, every simulation gets its own copies of the model fields.
 
         Raises:
             ValueError: If a name or value is not allowed.
@@ -132,11 +132,11 @@ class Disturber:
 
     @property
     def varies_physics(self) -> bool:
-        """True if the physics of a simulation may differ from the model."""
+        """True if the physics of a simulation may differ from `task.model`."""
         return bool(self._physics.names)
 
     def start_nominal(self, ids: Ids) -> None:
-        """Restore the physics of the model; call it before the task draws a start state."""
+        """Undo variations of physics in simulations `ids`; call it before the task draws a start."""
         self._physics.restore(ids)
 
     def start(
@@ -150,7 +150,7 @@ class Disturber:
         Args:
             ids: The simulations, (n,).
             streams: A random generator for each of them.
-            given: Variations in place of drawn ones, by simulation and name.
+            given: Values in place of drawn ones, by simulation index and name of the variation.
         """
         for index, stream in zip(ids.tolist(), streams, strict=True):
             self._streams[index] = stream
@@ -180,7 +180,7 @@ class Disturber:
         self._start_joints[index] = stream.standard_normal(self._angles.size)
 
     def _drawn(self, name: str, share: float) -> float:
-        """Return a value of a variation: the lowest for `share` 0, the highest for `share` 1."""
+        """Return a value in the range of a variation: lowest for `share` 0, highest for 1."""
         if name == 'gravity_direction':
             return share * 2.0 * np.pi
         group, field_name = _SPANS[name]
@@ -196,7 +196,7 @@ class Disturber:
         self._uniform[index] = stream.random(self._uniform.shape[1:])
 
     def _shift_start(self, ids: Ids) -> bool:
-        """Shift objects and joints at the start of episodes; return whether any has moved."""
+        """Shift objects and joints in `ids`, whose episodes start; return whether any has moved."""
         start, moved = self.disturbances.start, False
         qpos: Array = self._task.batch.bind('qpos')
         if self._task.object_qpos is not None:
@@ -216,7 +216,7 @@ class Disturber:
     # Commands
 
     def command(self, commands: NDArray[np.floating]) -> NDArray[np.floating]:
-        """Return the commands (N, action size) after delay, loss, repetition, noise and bias."""
+        """Start a tick; return the disturbed commands (N, action size), in the same units."""
         self._tick += 1
         for index in np.flatnonzero(self._tick % _BLOCK == 0).tolist():
             self._draw_block(index)
@@ -247,15 +247,15 @@ class Disturber:
     def _error(self, name: str, noise: float | Array) -> Array:
         """Return the error of signal `name` at this tick, (N, components): bias plus white noise.
 
-        `name` is `action`, `joint`, `velocity`, `object` or `push`. `noise` is the standard
-        deviation of the white noise: one value, or one for each component.
+        `name` is `action`, `joint`, `velocity`, `object` or `push`. `noise`, the standard deviation
+        of the white noise, is one value or one for each component, in the unit of the signal.
         """
         columns = self._columns[name]
         white = self._normal[self._all, self._tick % _BLOCK, columns]
         return np.asarray(noise * white + self._biases[:, columns])
 
     def push(self, forces: Array) -> bool:
-        """Add this tick's pushes to forces and torques (N, bodies, 6); return True if any acts."""
+        """Add pushes in world axes to `forces` (N, bodies, 6) in place; return True if any acts."""
         pushes = self.disturbances.pushes
         if not pushes.force:
             return False
@@ -267,7 +267,7 @@ class Disturber:
     # Sensors
 
     def sense(self) -> None:
-        """Measure all sensors; `readings` returns these measurements until the next call."""
+        """Measure all sensors with errors and delays, once per tick; `readings` returns them."""
         self._sense(self._all, is_first=False)
 
     def readings(self) -> Readings:
@@ -275,13 +275,13 @@ class Disturber:
         return {name: values.copy() for name, values in self._held.items()}
 
     def true_readings(self) -> Readings:
-        """Return the present values of undisturbed sensors, in new arrays."""
+        """Return what sensors without disturbances measure in the present state, in new arrays."""
         if not self._is_true_current:
             return self._task.readings()
         return {name: past[0].copy() for name, past in self._true.items()}
 
     def note_written_state(self) -> None:
-        """Let `true_readings` measure again, because the user has changed the state."""
+        """Make `true_readings` measure again; call it after the user has changed the state."""
         self._is_true_current = False
 
     def _sense(self, ids: Ids, is_first: bool) -> None:
@@ -350,7 +350,7 @@ class Disturber:
     # Copies
 
     def state(self) -> dict[str, Any]:
-        """Return the complete state, for `pickle` and `copy.deepcopy`."""
+        """Return the complete state for `pickle` and `copy.deepcopy`; its arrays are not copied."""
         return {name: getattr(self, name) for name in _STATE} | {'varied': self._physics.names}
 
     def set_state(self, state: Mapping[str, Any]) -> None:
@@ -392,10 +392,10 @@ def _turned(quaternion: Array, turn: Array) -> Array:
 
 
 class VariedPhysics:
-    """Gives each simulation its own copy of some model fields, with varied values.
+    """Gives each simulation its own copies of model fields such as friction, and varies them.
 
     Attributes:
-        names: The variations of physics that `apply` uses.
+        names: The variations that `apply` uses.
     """
 
     def __init__(self, task: Task, physics: PhysicsDisturbance) -> None:
@@ -440,7 +440,7 @@ class VariedPhysics:
         return any(len(rows) for rows in self._rows[name].values())
 
     def allow(self, name: str) -> None:
-        """Add a variation to `names`; raise ValueError if task or model does not allow it."""
+        """Add a variation to `names`; ValueError if the task lacks it or the model was shared."""
         if name in self.names:
             return
         if not self._has(name):
@@ -457,14 +457,14 @@ class VariedPhysics:
         self.names.append(name)
 
     def restore(self, ids: Ids) -> None:
-        """Restore the physics of the model in simulations `ids`."""
+        """Undo all variations in the simulations `ids`."""
         for field, values in self._live.items():
             values[ids] = self._nominal[field]
 
     def apply(self, ids: Ids, variations: Mapping[str, Array]) -> bool:
         """Vary the physics of simulations `ids` by `variations`, (N,) each; call `restore` first.
 
-        Returns False if `names` is empty, so that nothing varies.
+        Return False if `names` is empty, so that nothing varies.
         """
         for name in self.names:
             factors, live = variations[name][ids], self._live
@@ -485,7 +485,7 @@ class VariedPhysics:
         return bool(self.names)
 
     def _tilted(self, tilt: Array, direction: Array) -> Array:
-        """Return gravity (n, 3), m/s^2, tilted by `tilt`, rad, towards the azimuth `direction`."""
+        """Return gravity (n, 3), m/s^2, tilted by `tilt` towards azimuth `direction`, both rad."""
         strength = float(np.linalg.norm(self._nominal['opt.gravity']))
         across = np.sin(tilt) * strength
         return np.stack(

@@ -4,8 +4,8 @@ Only the assets of this package are used. The package is never imported, because
 MuJoCo >= 3.17 registers environments that do not start.
 
 Tuning makes a model faster to step; trajectories stay the same, bit for bit. It disables stages
-whose results are unused. It also reduces the pairs of geoms that collision detection tests, with
-the same contacts in the same order. `docs/simulation.md` lists the gains.
+of a step whose results are unused. It also reduces the pairs of geoms that collision detection
+tests; contacts and their order stay the same. `docs/simulation.md` lists the gains.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ def load_spec(relative: str) -> mujoco.MjSpec:
 
 
 def load_model(relative: str) -> mujoco.MjModel:
-    """Compile an MJCF asset without tuning."""
+    """Compile an MJCF asset, such as `hand/reach.xml`, without changes for faster steps."""
     return load_spec(relative).compile()
 
 
@@ -84,12 +84,12 @@ def compiled_bytes(model: mujoco.MjModel) -> bytes:
 
 
 def find(model: mujoco.MjModel, kind: Any, name: str) -> int:
-    """Return the index of a model element; `kind` is for example `mjOBJ_BODY`. -1 if missing."""
+    """Return the index of element `name`, -1 if missing; `kind` is for example `mjOBJ_BODY`."""
     return int(mujoco.mj_name2id(model, kind.value, name))
 
 
 def free_joint(model: mujoco.MjModel, body: str | None) -> tuple[slice, slice] | tuple[None, None]:
-    """Return the slices of the free joint `<body>:joint` in qpos and qvel; None if missing."""
+    """Return the qpos and qvel slices of the free joint `<body>:joint`; (None, None) without it."""
     number = find(model, mujoco.mjtObj.mjOBJ_JOINT, f'{body}:joint')
     if number < 0 or model.jnt_type[number] != mujoco.mjtJoint.mjJNT_FREE.value:
         return None, None
@@ -98,7 +98,7 @@ def free_joint(model: mujoco.MjModel, body: str | None) -> tuple[slice, slice] |
 
 
 def geom_color(model: mujoco.MjModel, geom: int) -> Array:
-    """Return the RGBA colour (4,) of a geom, or of its material if the geom's is the default."""
+    """Return the RGBA colour (4,), 0 ... 1, of a geom, or of its material if its own is default."""
     own = np.array(model.geom_rgba[geom], dtype=np.float64)
     material = int(model.geom_matid[geom])
     if material < 0 or not np.array_equal(own, _NO_COLOR):
@@ -110,7 +110,7 @@ def geom_color(model: mujoco.MjModel, geom: int) -> Array:
 
 
 def exclude_body_pairs(spec: mujoco.MjSpec, pairs: Sequence[tuple[str, str]]) -> None:
-    """Exclude pairs of bodies from collision tests; unknown bodies are ignored."""
+    """Exclude pairs of bodies, by name, from collision tests; skip pairs with unknown bodies."""
     bodies = {body.name for body in spec.bodies}
     for first, second in pairs:
         if first in bodies and second in bodies:
@@ -118,9 +118,9 @@ def exclude_body_pairs(spec: mujoco.MjSpec, pairs: Sequence[tuple[str, str]]) ->
 
 
 def list_geom_pairs(spec: mujoco.MjSpec) -> None:
-    """Replace MuJoCo's search for geoms that may collide by a fixed list of their pairs.
+    """Replace MuJoCo's search for geoms that may collide by `<pair>` elements, in place.
 
-    A short list is cheaper than sorting all bodies along an axis at every substep.
+    All geoms must be in `spec` already. A list is cheaper than sorting bodies at every substep.
     """
     model = spec.compile()
     geoms = {geom.id: geom for geom in spec.geoms}
@@ -137,7 +137,7 @@ def list_geom_pairs(spec: mujoco.MjSpec) -> None:
 
 
 def collision_candidates(model: mujoco.MjModel) -> list[tuple[int, int]]:
-    """Return ascending pairs of geom indices that MuJoCo tests, without the model's `<pair>`s."""
+    """Return sorted pairs of geom indices that MuJoCo tests, except those of `<pair>` elements."""
     listed = set(zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True))
     return [
         (first, second)
@@ -150,7 +150,7 @@ def collision_candidates(model: mujoco.MjModel) -> list[tuple[int, int]]:
 
 
 def skip_unread_stages(model: mujoco.MjModel) -> None:
-    """Disable sensors, and constraint islands in models with a single kinematic tree."""
+    """Disable sensors of `model`, and constraint islands if it has a single kinematic tree."""
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_SENSOR.value
     if model.ntree == 1:
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ISLAND.value
@@ -178,7 +178,7 @@ def _bodies_may_collide(model: mujoco.MjModel, first: int, second: int) -> bool:
 
 
 def mix(model: mujoco.MjModel, first: Geoms, second: Geoms) -> dict[str, NDArray[Any]]:
-    """Return the contact parameters (n, ...) of n pairs of geoms, by the names of `MjsPair`.
+    """Return the contact parameters (n, ...) of n pairs of geom indices, by names of `MjsPair`.
 
     The result equals that of `mj_contactParam`. The geom with the higher priority decides. The
     parameters of geoms with equal priority are mixed. Margins and gaps add up.
@@ -215,7 +215,7 @@ def _rows(flags: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def _share(one: NDArray[Any], other: NDArray[Any]) -> NDArray[Any]:
-    """Return the weight (n,) of the first of two geoms in a mix, from their values of `solmix`."""
+    """Return weights (n,), 0 ... 1, of first geoms in a mix; arguments are the `solmix` of both."""
     small_one, small_other = one < mujoco.mjMINVAL, other < mujoco.mjMINVAL
     weighed = one / np.where(small_one | small_other, 1.0, one + other)
     cases = [small_one & small_other, small_one, small_other]
@@ -223,9 +223,9 @@ def _share(one: NDArray[Any], other: NDArray[Any]) -> NDArray[Any]:
 
 
 class ListedPairs:
-    """Updates the parameters of a model's `<pair>` elements when parameters of their geoms change.
+    """Updates contact parameters of `<pair>` elements when parameters of their geoms change.
 
-    A pair is never changed if its compiled parameters differ from the mix of its geoms.
+    A pair is never changed if its parameters differed from the mix of its geoms at construction.
     """
 
     def __init__(self, model: mujoco.MjModel) -> None:
@@ -236,11 +236,11 @@ class ListedPairs:
         self.note(model)
 
     def note(self, model: mujoco.MjModel) -> None:
-        """Store the geom parameters of a model, without changing its pairs."""
+        """Store the geom parameters with which `follow` compares later ones."""
         self._geoms = {name: getattr(model, f'geom_{name}').copy() for name in _OF_GEOMS}
 
     def follow(self, model: mujoco.MjModel) -> None:
-        """Recompute the contact parameters of pairs whose geoms have changed since `note`."""
+        """Recompute, in place, pairs whose geoms changed since the last `note` or `follow`."""
         changed = np.zeros(model.ngeom, dtype=np.bool_)
         for name, before in self._geoms.items():
             changed |= _rows(getattr(model, f'geom_{name}') != before)

@@ -75,7 +75,7 @@ def _current_of_egl() -> tuple[Any, ...] | None:
 
 @functools.cache
 def _process_that_draws() -> int:
-    """Return the id of the process that rendered first; forked processes inherit the value."""
+    """Return the id of the process of the first call; forked processes inherit the value."""
     return os.getpid()
 
 

@@ -66,7 +66,7 @@ class SceneRenderer:
         """Return the picture of a frame, (height, width, 3) bytes.
 
         Args:
-            trail: Earlier positions of the object, gripper or first fingertip, (3,) each.
+            trail: Earlier positions of object, gripper or first fingertip, (3,) each, m.
         """
         self._update(frame)
         scene = self._renderer.scene
@@ -77,7 +77,7 @@ class SceneRenderer:
             return np.asarray(self._renderer.render())
 
     def render_depth(self, frame: Frame) -> NDArray[np.float32]:
-        """Return distances from the camera plane, (height, width), m, without markers."""
+        """Return distances from the camera plane, (height, width), m; goal markers are left out."""
         self._update(frame)
         self._renderer.enable_depth_rendering()
         try:
@@ -93,7 +93,7 @@ class SceneRenderer:
 
     @contextlib.contextmanager
     def _in_its_thread(self) -> Iterator[None]:
-        """Replace errors by a one-line RuntimeError if another thread created the renderer."""
+        """Replace an error in the block by a RuntimeError if another thread made the renderer."""
         try:
             with context_of_its_own():
                 yield
@@ -114,7 +114,7 @@ class SceneRenderer:
 
 
 def make_options() -> mujoco.MjvOption:
-    """Return options that hide rangefinder rays and all sites outside of group `SHOWN_SITES`."""
+    """Return drawing options that hide rangefinder rays and sites outside group `SHOWN_SITES`."""
     options = mujoco.MjvOption()
     options.flags[mujoco.mjtVisFlag.mjVIS_RANGEFINDER.value] = 0
     options.sitegroup[:] = 0
@@ -129,7 +129,10 @@ def check_size(width: object, height: object) -> None:
 
 
 def make_camera(scene: Scene, name: str | Mapping[str, Any] | None) -> mujoco.MjvCamera:
-    """Return the camera `name`, or the scene's view changed by attributes, or raise ValueError."""
+    """Return the camera called `name`, or the scene's view changed by the attributes `name`.
+
+    None leaves the view unchanged. Unknown names and invalid values raise ValueError.
+    """
     camera = mujoco.MjvCamera()
     if name is None or isinstance(name, Mapping):
         scene.view.apply(camera)
@@ -144,7 +147,7 @@ def make_camera(scene: Scene, name: str | Mapping[str, Any] | None) -> mujoco.Mj
 def set_attributes(
     camera: mujoco.MjvCamera, attributes: Mapping[str, Any], model: mujoco.MjModel
 ) -> None:
-    """Set attributes of a camera of a model.
+    """Set attributes of `camera`, such as `distance`, for pictures of `model`.
 
     Raises:
         ValueError: If an attribute is unknown, or if MuJoCo cannot render with its value.

@@ -121,7 +121,7 @@ class Marker:
     quaternion: Array = field(default_factory=lambda: np.array([1.0, 0.0, 0.0, 0.0]))
 
     def draw(self, geom: mujoco.MjvGeom) -> None:
-        """Write the shape into a geom of a MuJoCo scene."""
+        """Overwrite a geom of a MuJoCo scene with this shape."""
         rotation = np.zeros(9)
         mujoco.mju_quat2Mat(rotation, self.quaternion)
         color = np.array(self.color, dtype=np.float32)
@@ -132,9 +132,9 @@ class Scene:
     """Shows robot, object and goal of a task in the state of a frame.
 
     Attributes:
-        spec: The task, whose thresholds the markers show; it may be replaced.
+        spec: The task. A caller that changes thresholds assigns another `TaskSpec`.
         model: The compiled `mujoco.MjModel`, for pictures only.
-        data: Its `mujoco.MjData` in the pose of the last frame.
+        data: Its `mujoco.MjData`; `show` sets `qpos` and computes no kinematics.
     """
 
     def __init__(self, task: str) -> None:
@@ -157,7 +157,7 @@ class Scene:
         return is_pose and self.spec.has_object and self._ghost is not None
 
     def show(self, frame: Frame) -> None:
-        """Set the poses of robot, object and ghost; set other joints if the frame has `qpos`."""
+        """Set `data.qpos` of robot, object and ghost; of other joints if the frame has `qpos`."""
         if frame.qpos is not None and frame.qpos.shape == self.data.qpos.shape:
             self.data.qpos[:] = frame.qpos
         self.data.qpos[self._joints] = frame.joint_position
@@ -167,11 +167,7 @@ class Scene:
             self.data.qpos[self._ghost] = ghost_pose(self.spec, frame.desired_goal)
 
     def markers(self, frame: Frame, trail: Sequence[Array] = ()) -> list[Marker]:
-        """Return the markers of goal, achieved goal and trail.
-
-        Args:
-            trail: Earlier positions (3,) of object, gripper or first fingertip, the oldest first.
-        """
+        """Return the markers of goal, achieved goal and trail; see `trail_of` for `trail`."""
         color = REACHED if frame.is_success else MISSED
         if self.has_ghost:
             shapes = self._shell(frame, color)
@@ -183,7 +179,7 @@ class Scene:
         return [*shapes, *_line(trail, width)]
 
     def object_markers(self, frame: Frame) -> list[Marker]:
-        """Return the object as markers, for viewers without the model."""
+        """Return the markers of the object for viewers without the model; [] if no object."""
         if self._object is None or frame.object_pose is None:
             return []
         body = self.model.body(self.spec.object_name)
@@ -191,7 +187,7 @@ class Scene:
         return [self._geom_marker(geom, frame.object_pose) for geom in range(first, first + count)]
 
     def table_markers(self) -> list[Marker]:
-        """Return the fixed geoms except robot and floor, such as the table of the Fetch tasks."""
+        """Return markers of all fixed geoms except robot and floor, such as the table (Fetch)."""
         return self._table
 
     @cached_property
@@ -209,7 +205,7 @@ class Scene:
         return markers
 
     def _geom_marker(self, geom: int, pose: Array) -> Marker:
-        """Return the marker of a geom whose body has the pose (7,)."""
+        """Return the marker of the geom with the id `geom`, whose body has `pose` (7,)."""
         model = self.model
         position, quaternion = np.zeros(3), np.zeros(4)
         mujoco.mju_mulPose(
@@ -220,7 +216,7 @@ class Scene:
         return Marker(shape, size, position, (red, green, blue, opacity), quaternion)
 
     def _shell(self, frame: Frame, color: Color) -> list[Marker]:
-        """Return a list with one marker, a shell around the ghost; `color` shows success."""
+        """Return a list with one marker, a transparent shell of this colour around the ghost."""
         geom = self.model.geom(GHOST)
         pose = ghost_pose(self.spec, frame.desired_goal)
         tint = (*color[:3], 2.0 * _HALO_OPACITY)
@@ -229,7 +225,7 @@ class Scene:
 
 
 def ghost_pose(spec: TaskSpec, goal: Array) -> Array:
-    """Return the ghost's pose (7,): the goal (7,), moved aside if the task counts only rotation."""
+    """Return the pose (7,) of the ghost, which is `goal`, 0.15 m aside if only rotation counts."""
     pose = np.array(goal)
     if not spec.position_counts:
         pose[:3] += GHOST_OFFSET
@@ -237,14 +233,14 @@ def ghost_pose(spec: TaskSpec, goal: Array) -> Array:
 
 
 def tracked_position(frame: Frame) -> Array:
-    """Return the position (3,) of the object, else of the gripper or the first fingertip."""
+    """Return the position (3,) of the object; without object, of gripper or first fingertip."""
     if frame.object_pose is not None:
         return frame.object_pose[:3].copy()
     return frame.achieved_goal[:3].copy()
 
 
 def trail_of(frames: Sequence[Frame], index: int) -> list[Array]:
-    """Return tracked positions (3,) of frame `index` and up to `TRAIL_TICKS` frames before."""
+    """Return `tracked_position` of up to `TRAIL_TICKS` frames before `index`, then of `index`."""
     return [tracked_position(frame) for frame in frames[max(0, index - TRAIL_TICKS) : index + 1]]
 
 
@@ -296,7 +292,7 @@ def _capsule(start: Array, end: Array, width: float, color: Color) -> Marker:
 
 
 def _dress(mjcf: mujoco.MjSpec) -> None:
-    """Set floor, sky and light of the model of a task; hide its goal markers and mocap body."""
+    """Set floor, sky and light of a model in place; hide mocap body and sites, except pen ends."""
     for texture in mjcf.textures:
         if texture.type == mujoco.mjtTexture.mjTEXTURE_SKYBOX:
             texture.rgb1, texture.rgb2 = [0.93, 0.95, 0.97], [0.66, 0.73, 0.8]

@@ -65,7 +65,7 @@ class StepResult:
 
     Attributes:
         observation: `observation`, `achieved_goal`, `desired_goal`, each (N, ...).
-        reward: (N,), sparse -1 or 0, dense minus the distance (m; poses 10 x m + rad).
+        reward: (N,), sparse -1 or 0; dense -distance (m), poses -(10 x distance + rotation (rad)).
         success: (N,) booleans, at this step.
         diverged: (N,) booleans: MuJoCo diverged and the simulation was reset. Observation, reward
             and success are then those of the new episode.
@@ -104,8 +104,8 @@ class Simulation:
 
     Attributes:
         spec: The task as data, with `episode_ticks` at this rate.
-        metric: Computes rewards and success; users may replace it between steps.
-        divergences: Number of divergences so far.
+        metric: `GoalMetric` for rewards and success; users may replace it between steps.
+        divergences: Number of divergences of all copies so far.
 
     Raises:
         ValueError: If an argument is not allowed; the message lists the allowed values.
@@ -202,7 +202,7 @@ class Simulation:
         self._task.read_data(self._index(index), self._fitting(data))
 
     def write_data(self, index: int, data: Any) -> None:
-        """Set the state of simulation `index` to that of a `mujoco.MjData`."""
+        """Set state and derived values of simulation `index` to those of a `mujoco.MjData`."""
         self._task.write_data(self._index(index), self._fitting(data))
         if self._disturber is not None:
             self._disturber.note_written_state()
@@ -218,7 +218,7 @@ class Simulation:
         self._task.follow_model()
 
     def generator(self, index: int) -> np.random.Generator:
-        """Return the random generator, no copy, that draws starts and goals of a simulation."""
+        """Return the random generator itself that draws starts and goals of simulation `index`."""
         generator = self._generators[self._index(index)]
         if generator is None:
             generator = self._generators[index] = seeding.np_random(None)[0]
@@ -249,8 +249,7 @@ class Simulation:
                 `object_velocity` (6,). Joints and objects with a given position start at rest
                 unless a velocity is given, too. `disturbances` may shift the start.
             goal: Desired goals in place of drawn ones, as `set_goal` takes them: (goal size,) for
-                all, or one or None for each simulation of `ids`. The other draws
-                do not change.
+                all, or one or None for each simulation of `ids`. Drawn starts stay the same.
 
         Returns:
             The observations of all N simulations.
@@ -312,7 +311,7 @@ class Simulation:
     def compute_reward(
         self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any = None
     ) -> Array:
-        """Return rewards (...,) of goals (..., goal size) of any batch shape.
+        """Return rewards (...,) for achieved and desired goals (..., goal size) of any batch shape.
 
         `info` is ignored; it is part of Gymnasium's interface.
         """
@@ -321,11 +320,11 @@ class Simulation:
     def compute_success(
         self, achieved_goal: ArrayLike, desired_goal: ArrayLike
     ) -> NDArray[np.bool_]:
-        """Return success (...,) of goals (..., goal size) of any batch shape."""
+        """Return success (...,) for goals (..., goal size), as `compute_reward` takes them."""
         return self.metric.success(achieved_goal, desired_goal)
 
     def set_goal(self, goals: ArrayLike, ids: ArrayLike | None = None) -> None:
-        """Replace desired goals.
+        """Replace desired goals; ValueError if a shape or value is invalid.
 
         Quaternions are normalised and moved to the hemisphere nearest to the object's quaternion,
         because the `gymnasium` success rule distinguishes q from -q.
@@ -346,7 +345,8 @@ class Simulation:
 
         Args:
             body: Name of a movable body of the model.
-            wrench: (6,) force in N and torque in N m, world axes, at the centre of mass.
+            wrench: (6,) force in N and torque in N m, world axes, at the centre of mass; it
+                replaces an earlier one.
             index: The simulation.
         """
         values = finite_numbers('wrench', wrench, (6,))
@@ -358,7 +358,7 @@ class Simulation:
         self._is_pushed = True
 
     def resting_commands(self) -> Array:
-        """Return the commands (N, action size) that keep the robots as they are."""
+        """Return the commands (N, action size) that leave the robots' present targets unchanged."""
         return self._task.resting_commands()
 
     @property
@@ -368,7 +368,7 @@ class Simulation:
 
     @disturbances.setter
     def disturbances(self, disturbances: Disturbances | Mapping[str, Any] | str | None) -> None:
-        """Replace the disturbances; every simulation must be reset afterwards."""
+        """Replace the disturbances (None: off); every simulation must be reset afterwards."""
         chosen = read_disturbances(disturbances)
         if self._disturber is not None:
             self._disturber.start_nominal(self._all)
@@ -381,14 +381,14 @@ class Simulation:
         return self._disturber is not None and self._disturber.varies_physics
 
     def variation(self, index: int) -> dict[str, float]:
-        """Return the variations of the running episode, drawn or given; {} without disturbances."""
+        """Return the variations of the running episode by name; {} without disturbances."""
         index = self._index(index)
         if self._disturber is None:
             return {}
         return {name: float(values[index]) for name, values in self._disturber.variations.items()}
 
     def readings(self) -> Readings:
-        """Return sensor readings in new arrays, (N, topic.size) for each topic."""
+        """Return sensor readings, with disturbances, by topic in new arrays (N, topic.size)."""
         return self.true_readings() if self._disturber is None else self._disturber.readings()
 
     def true_readings(self) -> Readings:
@@ -397,14 +397,14 @@ class Simulation:
         return self._task.readings() if disturber is None else disturber.true_readings()
 
     def observe(self) -> Observation:
-        """Return the present observation in new arrays."""
+        """Return the present observation of all simulations, as in `StepResult`, in new arrays."""
         if self._disturber is None:
             return self._sensed(*self._task.observe())
         sensed, _ = self._task.observe_from(self._disturber.readings())
         return self._sensed(sensed, achieved_goal(self.spec, self._disturber.true_readings()))
 
     def observe_from(self, readings: Readings) -> Observation:
-        """Return the observation computed from sensor readings, a result of `readings`."""
+        """Return observation and achieved goal computed from a result of `readings`."""
         return self._sensed(*self._task.observe_from(readings))
 
     def __copy__(self) -> Simulation:
@@ -572,7 +572,7 @@ class Simulation:
         return finite_numbers(name, values, shape)
 
     def _fitting(self, data: Any) -> Any:
-        """Return `data`; raise ValueError unless it is an `MjData` that fits `model`."""
+        """Return `data`; ValueError unless it is an `MjData` with as many positions as `model`."""
         shape = (self.model.nq,)
         if not isinstance(data, mujoco.MjData) or data.qpos.shape != shape:
             raise ValueError(

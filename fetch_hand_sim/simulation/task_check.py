@@ -79,7 +79,11 @@ def _specification(spec: TaskSpec) -> Rules:
 
 
 def _model(task: Task) -> Rules:
-    """Yield (is met, error): an object has a free joint; simulated geoms equal the MJCF file."""
+    """Yield pairs (is met, error) about the model.
+
+    The object, if any, needs a free joint. Body, type, position and size of all simulated geoms
+    must equal those in the MJCF file of the task.
+    """
     name = task.spec.object_name
     yield (
         name is None or task.object_qpos is not None,
@@ -109,7 +113,7 @@ def _sensors(task: Task) -> Rules:
 
 
 def _formulas(task: Task) -> Rules:
-    """Yield pairs (is met, error) about the formulas of observation and achieved goal.
+    """Yield pairs (is met, error) about `observe_from`, the formulas of observation and goal.
 
     The formulas must accept readings with any leading axes, and compute each row independently.
     """
@@ -150,7 +154,7 @@ def _rewards(simulation: Simulation) -> Rules:
 
 
 def _resets(simulation: Simulation) -> Rules:
-    """Yield (is met, error): equal seeds repeat episodes; resets change no other simulation."""
+    """Yield (is met, error): equal seeds give equal starts; a reset changes only its `ids`."""
     size = simulation.spec.robot.action_size
     simulation.reset(seed=[0, 1])
     first = _all_sensors(simulation)

@@ -59,7 +59,6 @@ class UrdfJoint:
 
     Attributes:
         name: As in `joint_states`; fixed joints have the name of the child link and `/fixed`.
-        kind: Joint type of URDF.
         origin: Pose of the child relative to the parent at joint position 0.
         axis: (3,) axis of the joint in the frame of the child.
     """
@@ -95,7 +94,10 @@ class RobotDescription:
         self.joints = [joint for body in self._bodies for joint in self._joints_of(body)]
 
     def poses(self, positions: Mapping[str, float]) -> dict[str, Pose]:
-        """Return the pose of each link relative to the root; missing joint positions are 0."""
+        """Return the pose of each link relative to the root link `world`, by link name.
+
+        `positions` are rad or m, by joint name as in `joint_states`; missing ones count as 0.
+        """
         found = {ROOT: Pose(np.zeros(3), IDENTITY)}
         for joint in self.joints:
             found[joint.child] = found[joint.parent] @ joint.pose(positions.get(joint.name, 0.0))
@@ -128,7 +130,7 @@ class RobotDescription:
         return name.startswith(JOINT_PREFIX) and not is_mocap and 'external_camera' not in name
 
     def _joints_of(self, body: int) -> Iterator[UrdfJoint]:
-        """Yield the chain of joints from a body's parent to the body."""
+        """Yield the URDF joints that together connect a body's parent with the body, in order."""
         model = self._model
         name = model.body(body).name
         parent_body = int(model.body_parentid[body])
@@ -220,7 +222,7 @@ def add_shapes(
 def _shapes(
     mjcf: mujoco.MjSpec, model: mujoco.MjModel, geom: int
 ) -> Iterator[tuple[ElementTree.Element, Array, Array]]:
-    """Yield (element, position, quaternion) of a geom's shapes in its body; three for a capsule."""
+    """Yield each URDF shape of a geom with its pose in the body's frame; a capsule has three."""
     position, quaternion = model.geom_pos[geom].copy(), model.geom_quat[geom].copy()
     size = model.geom_size[geom]
     kind = int(model.geom_type[geom])
@@ -246,7 +248,10 @@ def _sphere(radius: float) -> ElementTree.Element:
 def _mesh(
     mjcf: mujoco.MjSpec, model: mujoco.MjModel, mesh: int, position: Array, quaternion: Array
 ) -> tuple[ElementTree.Element, Array, Array]:
-    """Return a mesh element and the pose of its file frame, from the pose of its inertia frame."""
+    """Return a `mesh` element, and the position and quaternion of its file's frame in the body.
+
+    `position` and `quaternion` belong to the inertia frame, in which MuJoCo stores the mesh.
+    """
     source: Any = mjcf.mesh(model.mesh(mesh).name)
     path = (Path(mjcf.modelfiledir) / mjcf.meshdir / source.file).resolve()
     back = np.array([1.0, -1.0, -1.0, -1.0]) * model.mesh_quat[mesh]
@@ -262,7 +267,7 @@ def _add_color(element: ElementTree.Element, model: mujoco.MjModel, geom: int) -
 
 
 def add_origin(element: ElementTree.Element, position: ArrayLike, quaternion: ArrayLike) -> None:
-    """Add an `origin` element with position, roll, pitch and yaw."""
+    """Add an `origin` element: position, m, and quaternion wxyz as roll, pitch and yaw, rad."""
     ElementTree.SubElement(
         element, 'origin', xyz=numbers(position), rpy=numbers(roll_pitch_yaw(quaternion))
     )

@@ -27,7 +27,7 @@ _DESCRIPTION = (
 
 
 def _namespace(text: str) -> str:
-    """Check a namespace for argparse and remove the slashes around it."""
+    """Return a namespace without slashes around it; ArgumentTypeError if it is invalid."""
     inner = text.strip('/')
     if _is_namespace(inner):
         return inner
@@ -44,7 +44,7 @@ def _is_namespace(text: str) -> bool:
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
-    """Parse and check the command line; `ros_arguments` are those from `--ros-args` on."""
+    """Parse `arguments`, by default `sys.argv`; `ros_arguments` are those from `--ros-args` on."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     cut = words.index('--ros-args') if '--ros-args' in words else len(words)
     parser = CommandParser(prog='view', description=_DESCRIPTION)
@@ -80,7 +80,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
 
 
 def _given(options: argparse.Namespace, *names: str) -> str:
-    """Return which of the options `names` are set, as text such as `--task and --policy`."""
+    """Return the options of `names` that are set, like `--task and --policy`; '' if none."""
     return ' and '.join(f'--{name.replace("_", "-")}' for name in names if getattr(options, name))
 
 

@@ -54,7 +54,7 @@ class Curves:
         self._rows.append(np.concatenate([first, *values]))
 
     def graphs(self, ticks: int | None = None) -> Graphs:
-        """Return the curves of the first `ticks` stored ticks; None returns all."""
+        """Return the curves of the oldest `ticks` stored ticks; None returns all."""
         commands = len(self._commanded)
         rows = np.concatenate([[], *self._rows]).reshape(-1, 4 + 2 * commands)[:ticks]
 
@@ -72,7 +72,8 @@ class Curves:
     def _positions(self, frame: Frame) -> Array:
         """Return the positions of the joints that the commands drive, (action size,).
 
-        Commands that move the gripper along an axis drive no single joint and have NaN.
+        Joints are in rad; the fingers of Fetch go from -1 (closed) to 1 (open). Commands that move
+        the gripper along an axis drive no single joint, so their position is NaN.
         """
         joints = frame.joint_position
         positions = np.array([np.nan if i is None else joints[i] for i in self._commanded])
@@ -83,7 +84,7 @@ class Curves:
 
 
 class History:
-    """Stores `picture` (newest tick of a running robot, with trail) and `curves` of past ticks."""
+    """Stores the newest tick of a robot with its trail (`picture`) and past ticks (`curves`)."""
 
     def __init__(self, spec: TaskSpec, metric: GoalMetric) -> None:
         self.spec = spec
@@ -92,7 +93,7 @@ class History:
         self._trail: deque[Array] = deque(maxlen=TRAIL_TICKS)
 
     def use_metric(self, metric: GoalMetric) -> None:
-        """Begin new curves with another metric."""
+        """Remove the curves and begin new ones with another metric."""
         self.curves = Curves(self.spec, metric)
 
     def begin_episode(self) -> None:
@@ -100,7 +101,7 @@ class History:
         self._trail.clear()
 
     def add(self, stamp_ns: int, frame: Frame, reward: float | None, command: Array | None) -> None:
-        """Append a tick; if its stamp is before the last one, begin new curves."""
+        """Append a tick; if its stamp is before the last one, first remove the old curves."""
         if stamp_ns < self.picture.stamp_ns:
             self.use_metric(self.curves.metric)
         self._trail.append(tracked_position(frame))

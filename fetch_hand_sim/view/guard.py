@@ -79,7 +79,7 @@ class Attendance:
         self._visits += 1
 
     def has_left(self) -> bool:
-        """Return True if the page sent no input for 3 s, or disconnected after the last call."""
+        """Return whether the page sent no input for 3 s, or disconnected since the last call."""
         visits, before = self._visits, self._known_visits
         self._known_visits = visits
         return visits != before or not self.is_there
@@ -111,7 +111,7 @@ class Guard:
         self._cookie = _COOKIE.format(port=port)
 
     def refusal(self, target: str, headers: Headers) -> Response | None:
-        """Return the error response to a request for `target` (path and query); None to accept."""
+        """Return the error response to a request for path and query `target`; None if accepted."""
         try:
             path = urlsplit(target).path
         except ValueError:
@@ -218,9 +218,9 @@ def guarded_serve(
 
 
 def _adapt(response: Response, is_read_only: bool) -> None:
-    """Add language and viewport tag to an HTML response, in place.
+    """Add the language and the viewport to an HTML page, in place.
 
-    In read-only mode, replace the text `Controlling` in the viewer's program by `Watching`.
+    In read-only mode, the viewer's WebAssembly program shows `Watching` instead of `Controlling`.
     """
     content = response.headers.get('Content-Type', '')
     body = bytes(response.body or b'')
@@ -233,7 +233,7 @@ def _adapt(response: Response, is_read_only: bool) -> None:
 
 
 def _attended(handler: Any, attendance: Attendance) -> Callable[[Any], Awaitable[None]]:
-    """Wrap a web socket handler; `attendance` then records input and end of the page in control."""
+    """Wrap `handler`; `attendance` then records input and disconnection of the page in control."""
 
     async def handle(connection: Any) -> None:
         # A browser that hangs does not confirm the end, and the next visitor would wait for it.

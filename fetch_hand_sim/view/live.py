@@ -54,7 +54,6 @@ class LiveRobot:
     """Follows the robot in the namespace of `node` and sends it the requests of the page.
 
     Args:
-        node: The node of this process.
         may_command: False for a page that can only watch (`--read-only`).
     """
 
@@ -89,7 +88,7 @@ class LiveRobot:
 
     @property
     def picture_period(self) -> float:
-        """Seconds between frames without input: 1/12 if faster than 1.5 x real time, else 1/30."""
+        """Frame period, s, for an idle user: 1/12 if the robot exceeds 1.5 x real time, or 1/30."""
         status = self._watch.status
         is_fast = status is not None and self._facts.rate > _HURRY * status.control_hz
         return OVERLOOKING if is_fast else FOLLOWING
@@ -210,7 +209,10 @@ class LiveRobot:
             self._update_facts(is_silent=False)
 
     def _look(self) -> None:
-        """Detect a restarted, replayed or silent robot; request speed and actor if outdated."""
+        """Update the page for a restarted, replayed or silent robot; a timer calls this method.
+
+        Also request the speed and the active actor if they may have changed.
+        """
         self._notice_other_robot()
         is_other = self._replays.look()
         replay = self._replays.replay
@@ -240,7 +242,7 @@ class LiveRobot:
             self._update_facts(notice='')
 
     def _follow_replay(self, name: str) -> None:
-        """Update what the page shows of the replay node `name`, which publishes no diagnostics."""
+        """Show rate and pause of the replay node `name`, and stop the commands of the page."""
         self._hear()
         self._asked_rate = None
         self._unread.add('speed')

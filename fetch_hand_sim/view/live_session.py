@@ -79,9 +79,10 @@ def _run(options: argparse.Namespace, stop: StopSignals) -> None:
 
 
 def attended(robot: LiveRobot, attendance: Attendance) -> Perform:
-    """Return a function that passes requests to a robot only while the page in control is in use.
+    """Return a function that passes requests to a robot while the page in control is in use.
 
-    Otherwise a button held on a hidden or disconnected page would repeat its request.
+    It drops requests if this page has been silent for 3 s, because a button held on a hidden or
+    disconnected page would repeat its request.
     """
 
     def perform(request: Request) -> None:
@@ -179,7 +180,7 @@ def _start(options: argparse.Namespace, node: Node, log: IO[str]) -> Nodes:
 
 
 def check_alive(nodes: Nodes, log: IO[str]) -> None:
-    """Raise NodeFailure if a started node has ended; the error shows its last output."""
+    """Raise NodeFailure if a started node has ended; the message shows the last lines of `log`."""
     for name, process in nodes.items():
         code = process.poll()
         if code is not None:
@@ -198,7 +199,7 @@ def _cause(code: int) -> str:
 
 
 def _give_way() -> None:
-    """Lower the priority of this process, but not of the nodes it has started."""
+    """Set the niceness of this process to 10; the nodes it has started keep theirs."""
     # On Linux each thread has a priority, which new threads inherit.
     for thread in os.listdir('/proc/self/task'):
         with suppress(ProcessLookupError):

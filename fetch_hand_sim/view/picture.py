@@ -36,7 +36,7 @@ class Facts:
         is_replay: Whether a replay node publishes instead of a robot.
         is_silent: Whether the robot has stopped publishing; then other facts are the last known.
         is_commanding: Whether the sliders of the page command the robot.
-        notice: Line about the result of the last action, or ''.
+        notice: Line about the result of the user's last request, or ''.
     """
 
     source: str = 'live'
@@ -84,8 +84,8 @@ class Graphs:
         rotation: Rotation to the goal, rad, 0 ... pi.
         reward: Reward of each tick; NaN at a reset.
         commands: Values (ticks, action size), command units; NaN at a reset.
-        positions: Values (ticks, action size) of the joint that each command drives, rad. Fetch:
-            NaN for moves of the gripper along an axis; -1 (closed) to 1 (open) for the fingers.
+        positions: Positions (ticks, action size) of the commanded joints, rad. For Fetch, the first
+            three columns are NaN, and the last contains the fingers, -1 (closed) to 1 (open).
     """
 
     distance: Series | None = None

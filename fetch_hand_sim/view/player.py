@@ -97,7 +97,7 @@ class Player:
         return min(max(last, 0), len(times) - 1)
 
     def picture(self) -> Picture | None:
-        """Move the playhead; return the new picture, or None if nothing has changed."""
+        """Move the playhead to the present time; return a picture, or None if it is unchanged."""
         self._advance()
         now = (self._number, self.index, self._is_paused, self._speed, self._notice)
         if now == self._shown:
@@ -106,7 +106,7 @@ class Player:
         return self._make_picture()
 
     def perform(self, request: Request) -> None:
-        """Perform a request, unless the page may only watch."""
+        """Perform a playback request; show a notice instead if the page may only watch."""
         if not self._may_act:
             self._notice = ONLY_WATCHED
             return
@@ -137,14 +137,14 @@ class Player:
         self._position = float(self._recording.times[min(max(index, 0), last)])
 
     def _change(self, numbers: Sequence[int]) -> None:
-        """Open the first readable episode of `numbers`; if all are unreadable, show a notice."""
+        """Open the first readable episode of list positions `numbers`; show a notice if none is."""
         try:
             self._open_first(numbers)
         except EpisodeReadError as error:
             self._notice = str(error)
 
     def _open_first(self, numbers: Sequence[int]) -> None:
-        """Open the first readable episode of `numbers`; EpisodeReadError if all are unreadable."""
+        """Open the first readable episode of list positions `numbers`; else EpisodeReadError."""
         skipped: list[EpisodeReadError] = []
         for number in numbers:
             try:

@@ -25,7 +25,7 @@ class SetPaused(Request, messages.Event):
 
 @dataclass(frozen=True)
 class StepOnce(Request, messages.Event):
-    """Runs one tick, or moves the playhead of a file by `frames`."""
+    """Runs one tick of a robot, or pauses a file and moves its playhead by `frames` (-1: back)."""
 
     frames: int = 1
 
@@ -98,13 +98,13 @@ class Seek(Request, messages.Event):
 
 @dataclass(frozen=True)
 class ChangeEpisode(Request, messages.Event):
-    """Opens the episode that is `by` places further in the list, -1 for the one before."""
+    """Opens the episode `by` places further in the file player's list, which wraps around."""
 
     by: int
 
 
 @dataclass(frozen=True)
 class OpenEpisode(Request, messages.Event):
-    """Opens an episode of the list by its number, from 0."""
+    """Opens an episode of the file player's list by its number, from 0; ignored if unknown."""
 
     number: int

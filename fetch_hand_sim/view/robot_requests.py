@@ -48,7 +48,7 @@ class RemoteNode:
 
     Args:
         name: Name of the other node, fully qualified or relative to the namespace of `node`.
-        notice: Called with a line for the user, for example if a call is rejected.
+        notice: Called with a line for the user, for example if a call is rejected or not possible.
     """
 
     def __init__(self, node: Node, name: str, notice: Callable[[str], None]) -> None:
@@ -69,7 +69,10 @@ class RemoteNode:
         then: Callable[[], None] | None = None,
         **fields: Any,
     ) -> None:
-        """Call a service whose response has `success` and `message`; call `then` on success."""
+        """Call a service with request `fields`; call `then` if its response has `success`.
+
+        The `message` of the response, or that the node does not answer, goes to `notice`.
+        """
 
         def answered(response: Any) -> None:
             self._notice(response.message)
@@ -79,7 +82,7 @@ class RemoteNode:
         self._call(service, type_name, fields, answered)
 
     def get_parameter(self, name: str, then: Callable[[Any], None]) -> None:
-        """Request a parameter; call `then` with its value if the node exists and answers."""
+        """Request a parameter; `then` receives its value, if it is set and the node answers."""
         from rclpy.parameter import parameter_value_to_python
 
         def answered(future: Any) -> None:
@@ -98,7 +101,7 @@ class RemoteNode:
     def set_parameter(
         self, name: str, value: str | int | float, then: Callable[[], None] | None = None
     ) -> None:
-        """Set a parameter; call `then` if the node accepts the value."""
+        """Set a parameter; call `then` if the node accepts the value, `notice` if it does not."""
         from rclpy.parameter import Parameter
 
         def answered(response: Any) -> None:
@@ -148,9 +151,10 @@ class RemoteNode:
 
 
 class RobotRequests:
-    """Sends requests of the page to simulator, policy and replay node in the namespace of `node`.
+    """Sends requests of the page to the simulator node, the policy node or a replay node.
 
     Args:
+        node: Sends the requests; its namespace is that of the simulator and the policy node.
         tell: Called with keyword arguments: changed fields of `Facts`, the state shown by the page.
     """
 
@@ -171,7 +175,7 @@ class RobotRequests:
         return self._policy.is_there()
 
     def take_task(self, spec: TaskSpec) -> None:
-        """Store the robot's task; if it has changed, drop the user's goal and stop commanding."""
+        """Store the robot's task; a new one drops the user's goal and ends the page's commands."""
         if self._spec is not None and self._spec.name != spec.name:
             self.forget_goal()
             # Goals of another task may have another type.
@@ -185,7 +189,7 @@ class RobotRequests:
         self._kept_goal = self._asked_goal = None
 
     def take_replay(self, replay: Replay | None) -> None:
-        """Send requests to the node `replay` from now on; None sends them to the robot."""
+        """Control pause and speed of the node `replay` from now on, or of the robot if None."""
         if self._replay is not None:
             self._replay[1].close()
         self._replay = None
@@ -198,11 +202,11 @@ class RobotRequests:
             self._send_goal(self._kept_goal)
 
     def read_speed(self) -> None:
-        """Request the parameter with the speed; `tell` receives the answer as `speed`."""
+        """Request the speed, a multiple of real time; `tell` receives the answer as `speed`."""
         self._time.get_parameter(self._speed_name, lambda value: self._tell(speed=value))
 
     def read_actor(self) -> None:
-        """Request the parameter with the active actor; `tell` receives the answer as `actor`."""
+        """Request the name of the policy node's actor; `tell` receives the answer as `actor`."""
         if self._spec is not None:
             # An empty parameter means the shipped actor of the task.
             shipped = self._spec.name
@@ -211,7 +215,8 @@ class RobotRequests:
     def perform(self, request: Request, facts: Facts) -> None:
         """Send a request to the simulator, policy or replay node; ignore requests about files.
 
-        `facts` limit requests: `is_commanding` those with commands, `push_limit` those with pushes.
+        Commands are sent only if `facts.is_commanding`. The force of pushes is limited to
+        `facts.push_limit`, N. Requests are ignored before `take_task`, or if `fits` is False.
         """
         if self._spec is None or not self.fits(request):
             return
@@ -258,7 +263,7 @@ class RobotRequests:
                 self._time.set_parameter(name, factor, taken)
 
     def fits(self, request: Request) -> bool:
-        """Return whether a goal or command has the robot's size; True for other requests."""
+        """Return whether a goal or command has the task's size; True for other requests."""
         if self._spec is None or not isinstance(request, SetGoal | SetCommand):
             return True
         name = 'set_goal' if isinstance(request, SetGoal) else 'commands'
@@ -267,8 +272,7 @@ class RobotRequests:
     def shown_goal(self, goal: Array) -> Array:
         """Return the goal (goal size,) to draw; `goal` is the one that the robot publishes.
 
-        After the page has sent a goal, that goal is drawn until the robot publishes it, at most for
-        0.5 s.
+        A goal that the page has sent is drawn until the robot publishes it, at most for 0.5 s.
         """
         if self._asked_goal is not None:
             at, asked = self._asked_goal
@@ -279,7 +283,7 @@ class RobotRequests:
 
     @property
     def _time(self) -> RemoteNode:
-        """The node that controls pause and speed: the replay node, or without one `sim_node`."""
+        """The node with pause and speed: the replay node if there is one, else `sim_node`."""
         return self._sim if self._replay is None else self._replay[1]
 
     @property
@@ -319,7 +323,7 @@ class RobotRequests:
         self._publishers[name].publish(data)
 
     def _withdraw(self, name: str) -> None:
-        """Destroy the publisher of topic `name`; publishers of `commands` count as commanders."""
+        """Destroy the publisher of topic `name`; a node with one for `commands` is a commander."""
         publisher = self._publishers.pop(name, None)
         if publisher is not None:
             self._node.destroy_publisher(publisher)

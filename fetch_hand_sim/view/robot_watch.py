@@ -72,8 +72,8 @@ class RobotWatch:
         node: The node of this process.
         on_status: Called with each valid status; its task may differ from the last one.
         on_tick: Called with each tick.
-        every_tick: Whether each tick is needed. If not, ticks come from the topic `latest_tick`
-            if it has a publisher; replays do not publish it.
+        every_tick: If False, ticks come from the topic `latest_tick` while it has a publisher; its
+            rate is limited, so ticks may be missing. Replays do not publish it.
 
     Attributes:
         status: The latest status; None before the first.
@@ -115,7 +115,7 @@ class RobotWatch:
         return self.status.joint_prefix if self.status else JOINT_PREFIX
 
     def _on_status_message(self, message: Any) -> None:
-        """Handle an `episode_status` message; skip it if `latest_tick` delivers the status, too."""
+        """Handle an `episode_status` message, unless `latest_tick` delivers the same status."""
         try:
             status = _read_status(message)
         except ValueError:
@@ -213,7 +213,7 @@ class RobotWatch:
         return collect
 
     def _finish_tick(self, status: EpisodeStatus | None = None) -> None:
-        """Call `on_tick` if joints, goals and success have arrived; other values may be missing."""
+        """Call `on_tick` if joints, goals and success have arrived; `status` is for this tick."""
         values, spec = self._values, self.spec
         if spec is None or any(name not in values for name in _NEEDED):
             return
@@ -254,7 +254,7 @@ class ReplayWatch:
 
     Attributes:
         replay: The replay node; None without one, or if a robot also runs.
-        rate: Measured ticks per second.
+        rate: Measured ticks per wall-clock second; 0 in the first second.
     """
 
     def __init__(self, node: Node) -> None:
@@ -267,12 +267,12 @@ class ReplayWatch:
         self._paused_looks = 0
 
     def count_tick(self) -> None:
-        """Count a tick of the replay."""
+        """Count a tick of the replay, for `rate` and `stands_still`."""
         self._ticks += 1
         self._moved = True
 
     def look(self) -> bool:
-        """Read the ROS graph; return whether the replay node has started, stopped or changed."""
+        """Update `replay` and `rate` from the ROS graph; return whether `replay` has changed."""
         found, before = _find_replay(self._node), self.replay
         self.replay = found
         now = time.monotonic()
@@ -286,9 +286,9 @@ class ReplayWatch:
         return found != before
 
     def stands_still(self, is_paused: bool) -> bool:
-        """Return `is_paused`, but False if a tick since the last call shows a resumed replay.
+        """Return `is_paused`, but False if a tick has arrived since the last call.
 
-        Call periodically; the first two calls of a pause ignore ticks, which may precede it.
+        Call it periodically. The first two calls of a pause ignore ticks, which may precede it.
         """
         moved, self._moved = self._moved, False
         self._paused_looks = self._paused_looks + 1 if is_paused else 0

@@ -52,7 +52,6 @@ class Session:
     """Sends the state of a robot or file player to the page, and handles messages of the page.
 
     Args:
-        handle: The viewer that shows the page.
         picture: Returns a message with the new state, or None if nothing has changed.
     """
 
@@ -64,7 +63,7 @@ class Session:
         self._scene: Scene | None = None
 
     def update(self) -> bool:
-        """Return True if a new state was sent to the page; also handle messages of the page.
+        """Handle messages of the page and send it the new state; return False if nothing changed.
 
         Raises:
             Exception: The error that ended the thread of the viewer.
@@ -87,11 +86,7 @@ class Session:
 
 
 def _scene_of(task: str) -> Scene:
-    """Return the scene of a task.
-
-    Raises:
-        CommandError: If the task or its robot is not installed here.
-    """
+    """Return the scene of a task; CommandError if the task or its robot is not installed."""
     try:
         return Scene(task)
     except ValueError as error:

@@ -122,7 +122,7 @@ class FrameRate:
 
 
 class _Viewer(web_viewer.WebViewer):
-    """MuJoCo's web viewer, which accepts no files from the page."""
+    """MuJoCo's web viewer with the frame times of `frame_rate`; it ignores dropped files."""
 
     frame_rate: FrameRate
 
@@ -173,13 +173,13 @@ def open_page(
     attendance: Attendance | None = None,
     is_read_only: bool = False,
 ) -> tuple[viewer_handle.ViewerHandle, Address]:
-    """Serve the page from a thread, behind a `Guard`; return its viewer and its address.
+    """Serve the page from a thread, behind a `Guard`; return its viewer handle and address.
 
     Call it once per process.
 
     Args:
         host: Interface to listen on.
-        port: A port, or 0 for the first free one from 8080.
+        port: A port, or 0 for the first free one of 8080 ... 8099.
         attendance: Records whether the page in control is in use.
 
     Raises:
@@ -233,7 +233,7 @@ def _wake_seldom() -> None:
 
 
 def is_no_farewell(record: logging.LogRecord) -> bool:
-    """Filter for log records: return False to hide the error of a closed connection."""
+    """Return False for the error of a closed connection, so that the log omits the record."""
     error = record.exc_info[1] if record.exc_info else None
     return not isinstance(error, ConnectionClosed)
 
@@ -284,7 +284,7 @@ def _check_guarded(address: Address) -> None:
 
 
 def announce(address: Address, wants_browser: bool) -> None:
-    """Print the address, and open it in a browser if there is a display."""
+    """Print the address; open it in a browser if `wants_browser` and a display exists."""
     if address.warning:
         print(f'Warning: {address.warning}', flush=True)
     print(f'The page is at {address.url} (Ctrl-C ends)', flush=True)
@@ -299,7 +299,7 @@ def _has_display() -> bool:
 
 
 def open_browser(url: str, browser: Callable[[str], bool] = webbrowser.open) -> threading.Thread:
-    """Open an address in a browser from a thread; print a line if there is no browser."""
+    """Open an address in a browser from the returned thread; print a line if none is found."""
 
     def open_it() -> None:
         if not browser(url):

@@ -66,7 +66,7 @@ def transform_messages(transforms: Iterable[Transform], stamp_ns: int) -> list[T
 
 
 def marker_array(shapes: Mapping[str, Sequence[Shape]], stamp_ns: int) -> MarkerArray:
-    """Convert shapes, grouped by marker namespace, to markers that replace all earlier ones."""
+    """Convert shapes, by marker namespace, to markers in `world` that replace all earlier ones."""
     header = Header(stamp=stamp(stamp_ns), frame_id=ROOT)
     first = Marker(header=header, action=Marker.DELETEALL)
     markers = [first]
@@ -135,7 +135,7 @@ def _quaternion(wxyz: Array) -> Quaternion:
 
 
 def _scale(shape: Shape) -> Vector3:
-    """Return the full side lengths of a shape; MuJoCo stores radii and half lengths."""
+    """Return the full side lengths of a shape, m; MuJoCo stores radii and half lengths."""
     size = shape.size
     if shape.shape in _ROUND_RODS:
         size = np.array([size[0], size[0], size[1]])
@@ -169,7 +169,7 @@ class Scalars:
 
 
 class Camera:
-    """Draws `width` x `height` pictures of a scene, at most `hz` per second; none if `hz` is 0."""
+    """Draws `width` x `height` pictures, at most `hz` per second of `clock`; `hz` 0 draws none."""
 
     def __init__(self, width: int, height: int, hz: float, clock: Callable[[], float]) -> None:
         self.width, self.height = width, height
@@ -183,11 +183,11 @@ class Camera:
 
     @property
     def is_due(self) -> bool:
-        """True if the caller should render now; False if the last picture is too recent."""
+        """True if the caller should render now; False if the last picture is recent or `hz` is 0."""
         return np.isfinite(self._period) and self._clock() >= self._due
 
     def render(self, scene: Scene, frame: Frame) -> Picture:
-        """Return a picture (height, width, 3); the first call opens OpenGL."""
+        """Return a picture of `frame`, (height, width, 3); the first call opens OpenGL."""
         began = self._clock()
         self._due = max(self._due + self._period, began)
         if self._renderer is None:
@@ -198,7 +198,7 @@ class Camera:
         return picture
 
     def problem(self) -> str:
-        """Return a warning if drawing is too slow for the requested rate, else ''."""
+        """Return a warning if the median time to draw a picture exceeds 1 / `hz`, else ''."""
         seconds = self.picture_time.median()
         if seconds <= self._period:
             return ''

@@ -103,7 +103,7 @@ class VisualizationNode(Node):
             loop.close()
 
     def _open(self, source: TopicSpec) -> None:
-        """Open a topic's publisher; only warn if its message package is not installed."""
+        """Open a publisher for `source`; only warn if its message package is not installed."""
         try:
             self._outputs[source.name] = open_publisher(self, source)
         except ImportError:
@@ -128,7 +128,7 @@ class VisualizationNode(Node):
             self._scalars = Scalars(spec, status.success_rule)
 
     def _begin(self, spec: TaskSpec) -> None:
-        """Begin to follow a robot; publish its URDF and fixed transforms."""
+        """Begin to follow the robot of a task; publish its URDF and fixed transforms."""
         self._camera.close()
         self._latest = self._unmarked = self._undrawn = self._scalars = None
         try:
@@ -165,7 +165,7 @@ class VisualizationNode(Node):
             output.publish(output.msg_type(transforms=transform_messages(transforms, stamp_ns)))
 
     def _show_latest(self) -> None:
-        """Publish markers and pictures of the newest tick if subscribed; skip older ticks."""
+        """Publish markers and, if due, a picture of the newest tick to subscribers."""
         scene = self._scene
         if scene is None:
             return

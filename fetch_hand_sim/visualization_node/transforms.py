@@ -1,4 +1,4 @@
-"""Compute the coordinate frames of a robot: links of its URDF, object and goal."""
+"""Compute the poses of the coordinate frames of a robot's links, its object and its goal."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Transforms:
         return [self._between(joint.parent, joint.child, joint.pose()) for joint in joints]
 
     def moving(self, frame: Frame) -> list[Transform]:
-        """Return the transforms of one tick: moving links, object and goal."""
+        """Return the transforms of moving links, object and goal; HandReach has five goals."""
         found = [
             self._between(
                 joint.parent,
@@ -54,7 +54,7 @@ class Transforms:
         return [*found, *self._goal(frame.desired_goal)]
 
     def _position(self, joint: str, frame: Frame) -> float:
-        """Return the position of a joint, rad or m; 0 if the robot does not publish it."""
+        """Return the position of a joint, rad or m; 0 for a joint missing in `joint_states`."""
         index = self._index.get(joint)
         return 0.0 if index is None else float(frame.joint_position[index])
 
@@ -81,7 +81,7 @@ def frame_prefix(namespace: str) -> str:
 
 
 def view_transform(view: View, name: str) -> Transform:
-    """Return the world pose of a camera's optical frame `name` (x right, y down, z ahead)."""
+    """Return the pose in the world of the camera frame `name` (x right, y down, z ahead)."""
     azimuth, elevation = np.radians(view.azimuth), np.radians(view.elevation)
     level = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
     ahead = np.cos(elevation) * level + np.array([0.0, 0.0, np.sin(elevation)])

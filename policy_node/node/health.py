@@ -37,7 +37,7 @@ class Pace:
 
 
 def read_pace(message: Any, namespace: str) -> Pace | None:
-    """Return a robot's pace from a `/diagnostics` message; None without a robot in `namespace`."""
+    """Return the pace of the robot in `namespace` from `/diagnostics`; None if it is missing."""
     for status in message.status:
         if status.name.rpartition('/')[0] == namespace.rstrip('/'):
             values = {pair.key: pair.value for pair in status.values}
@@ -69,7 +69,7 @@ class Health:
         self._said: set[str] = set()
 
     def start(self, responder: Responder, status: EpisodeStatus, now: float) -> None:
-        """Begin to report on `responder`, which commands a robot; `now` is seconds of its clock."""
+        """Begin to report on `responder` and the robot of `status`; `now` is as in `report`."""
         self._responder, self._then = responder, now
         self._tick_duration = 1.0 / status.control_hz
         self._increases.clear()
@@ -131,7 +131,7 @@ class Health:
         return {name: round(self._increases[name].since(n)) for name, n in counters.items()}
 
     def news(self, report: Report) -> list[str]:
-        """Return the problem texts of `report` that the report of the last call did not have.
+        """Return the problem texts of `report` that are not in the report of the previous call.
 
         Problems with equal text before the first colon count as the same.
         """

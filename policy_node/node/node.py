@@ -110,7 +110,7 @@ class PolicyNode(Node):
         responder.send_unsent()
 
     def _load_ahead(self) -> LoadedPolicy | None:
-        """Load the policy early, to show errors; None if the policy depends on the robot's task."""
+        """Load the policy before a robot appears; None if that needs the task of the robot."""
         settings = self._settings
         try:
             return load_policy(
@@ -122,9 +122,9 @@ class PolicyNode(Node):
             raise UsageError(str(error)) from None
 
     def _start(self, status: EpisodeStatus, loop: EventLoop, stop: StopSignals) -> None:
-        """Subscribe to the state of the robot, wait for its publishers and open `commands`.
+        """Subscribe to the state of the robot, wait for its publishers, then advertise `commands`.
 
-        If `stop` is set, or the robot or policy changes, return early and do not open `commands`.
+        If `stop` is set, or the robot or policy changes, return without advertising `commands`.
 
         Raises:
             NodeFailure: If no policy is found, or the policy does not fit the robot.
@@ -172,7 +172,7 @@ class PolicyNode(Node):
         return before is not None and now is not None and not now.is_of_same_robot(before)
 
     def _take_policy(self, parameters: list[Parameter]) -> SetParametersResult:
-        """Check a change of parameters: load a new `policy`, or reject the change if that fails."""
+        """Return whether the change of parameters is accepted; a new `policy` is loaded first."""
         result = set_callback(POLICY_NODE)(parameters)
         for parameter in parameters:
             if parameter.name != 'policy' or not result.successful:
@@ -189,8 +189,8 @@ class PolicyNode(Node):
     def _load_for_one(self, name: str) -> tuple[LoadedPolicy | None, EpisodeStatus | None]:
         """Load the policy `name`; return the policy and the last status of a robot that it fits.
 
-        The policy is None if its task is unknown until a robot appears. The status is None if
-        no robot is known.
+        The status is None if no robot runs. The policy is None if it needs the task of a robot,
+        which is unknown then.
 
         Raises:
             ValueError: If the policy cannot be loaded, or fits no robot.
@@ -234,7 +234,7 @@ class PolicyNode(Node):
         self._health.stop()
 
     def _announce(self, policy: LoadedPolicy) -> None:
-        """Publish name and hash of the policy, which the robot logs, with the last status stamp."""
+        """Publish name and hash of the policy with the last status's stamp; the robot logs them."""
         status = topic(task_spec(policy.task), 'policy_status')
         values = {'commander': policy.description, 'checkpoint_sha256': policy.sha256}
         message = build_status(status, self._status_stamp, NODE_NAME, values)
@@ -300,7 +300,7 @@ class PolicyNode(Node):
         """Return whether to follow the robot that published `status`.
 
         True for the first robot, the present one, the only one on the topic (it replaced the
-        present one), and for a second robot whose task and frequency a policy fits.
+        present one), and for a second robot if a policy of its task and frequency is found.
         """
         known = self._status
         if known is None or status.is_of_same_robot(known):
@@ -342,7 +342,7 @@ class PolicyNode(Node):
             self.get_logger().warning(line)
 
     def _robots_elsewhere(self) -> list[str]:
-        """Return all namespaces that have a robot; called if this node's namespace has none."""
+        """Return the sorted namespaces, such as `/left`, in which a robot publishes its status."""
         wanted = topic(_ANY_TASK, 'episode_status')
         found = []
         for name, types in self.get_topic_names_and_types():

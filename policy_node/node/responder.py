@@ -37,7 +37,6 @@ class StampJoin:
     that the simulation was started again. A wrong stamp on one topic never becomes complete.
 
     Args:
-        topics: Names of the topics to join.
         max_pending: Number of incomplete stamps kept; the oldest is dropped first.
         clock: A steady clock, seconds.
 
@@ -60,7 +59,7 @@ class StampJoin:
         self.dropped = 0
 
     def add(self, topic: str, stamp: int, vector: NDArray[np.float64]) -> Vectors | None:
-        """Add a vector with its stamp, ns; return all vectors if the stamp is complete, or None."""
+        """Add a vector; return all vectors by topic if it completes `stamp`, ns, otherwise None."""
         if self._last is not None and self._is_late(self._last - stamp):
             return None
         vectors = self._pending.setdefault(stamp, {})
@@ -81,8 +80,8 @@ class StampJoin:
     def _is_late(self, delay: int) -> bool:
         """Return whether to drop a message that is `delay` ns older than the last complete stamp.
 
-        At delay 0: True. Above 0 and up to 1 s: True if that stamp became complete less than 1 s of
-        wall-clock time ago. Otherwise False: the message is newer, or the simulation restarted.
+        Drop delay 0, and delays up to 1 s if that stamp became complete less than 1 s of wall-clock
+        time ago. Keep newer messages (delay < 0) and, after a restart, messages with larger delays.
         """
         if not 0 < delay <= _LONGEST_DELAY:
             return delay == 0
@@ -123,7 +122,7 @@ class Responder:
         failed: Number of observations for which the policy failed.
         last_failure: Error of the last failure.
         inference: Durations of the policy's calls, from an observation to its command.
-        received_at: Time of the last complete observation, seconds of the clock.
+        received_at: Time of the last complete observation, seconds of the clock; None before.
         interval: Seconds between the last two complete observations; infinite before.
 
     Raises:
@@ -213,7 +212,7 @@ class Responder:
         is due. Otherwise a robot in lockstep would wait for ever.
 
         Raises:
-            ValueError: If the policy fails. The failure is counted.
+            ValueError: If the policy fails or the observation is invalid. The error is counted.
         """
         if self._due is not None:
             vectors, self._due, self._asked = self._due, None, None

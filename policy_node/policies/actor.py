@@ -67,7 +67,7 @@ class Normalizer(nn.Module):
         self.register_buffer('std', torch.ones(size))
 
     def forward(self, values: Tensor) -> Tensor:
-        """Return (values - mean) / std, (..., size), clipped to [-5, 5]."""
+        """Clip `values` to [-200, 200]; return (values - mean) / std, clipped to [-5, 5]."""
         clipped = values.clamp(-INPUT_CLIP, INPUT_CLIP)
         return ((clipped - self.mean) / self.std).clamp(-NORMALIZED_CLIP, NORMALIZED_CLIP)
 
@@ -84,7 +84,7 @@ class Actor(nn.Module, NetworkPolicy):
 
     @classmethod
     def from_arrays(cls, shape: NetworkShape, arrays: Mapping[str, NDArray[np.float32]]) -> Actor:
-        """Return an actor for inference with the tensors of a checkpoint."""
+        """Return an actor for inference; `arrays` are its tensors by their `state_dict` names."""
         actor = cls(shape)
         actor.load_state_dict({name: torch.tensor(value) for name, value in arrays.items()})
         return actor.eval().requires_grad_(False)
@@ -101,12 +101,12 @@ class Actor(nn.Module, NetworkPolicy):
         return inputs
 
     def forward(self, features: Tensor) -> Tensor:
-        """Return actions (..., action_size) in [-1, 1] for `features`."""
+        """Return actions (..., action_size) in [-1, 1] for network inputs made by `features`."""
         return torch.tanh(self.network(features))
 
     @torch.inference_mode()
     def act(self, seen: NDArray[np.float32], goal: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return actions (..., action_size) for `seen` (observation, past actions) and `goal`."""
+        """Return actions in [-1, 1] for `seen`, (..., input_size), and `goal`, (..., goal_size)."""
         action: Tensor = self(self.features(self._input(seen), self._input(goal)))
         found: NDArray[np.float32] = action.cpu().numpy()
         return found

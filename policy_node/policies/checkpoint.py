@@ -57,7 +57,9 @@ class ActorInfo:
         env_steps: Environment steps of the training.
         config: Training configuration by field.
         success: Measured success and how it was measured; empty if unmeasured.
-        goal_features: Goal inputs: `plain`, `relative` (and difference to the goal), `symmetric`.
+        goal_features: Network inputs: `plain` (observation and goal), `relative` (also the
+            difference between desired and achieved goal), `symmetric` (of the goal only this
+            difference; poses that look the same give equal inputs).
         init_from: Origin of the initial networks: `name`, `task`, `env_steps`, `init_from` (their
             own origin) and others. Empty for random networks.
         past_actions: Number of past actions among the inputs.
@@ -126,7 +128,7 @@ def to_bytes(actor: Actor, info: ActorInfo) -> bytes:
 
 
 def to_metadata(info: ActorInfo) -> dict[str, str]:
-    """Convert `info` to the metadata of a checkpoint or ONNX file, as texts by name."""
+    """Return metadata of a checkpoint or ONNX file: the format and the fields of `info` as JSON."""
     metadata = {'format': FORMAT, 'format_version': str(FORMAT_VERSION)}
     for name, value in dataclasses.asdict(info).items():
         metadata[name] = json.dumps(value)
@@ -134,15 +136,11 @@ def to_metadata(info: ActorInfo) -> dict[str, str]:
 
 
 def read(path: str | Path, task: str | None = None) -> Checkpoint:
-    """Read a checkpoint.
-
-    Args:
-        path: Checkpoint file.
-        task: Reject a checkpoint of any other task.
+    """Read a checkpoint, of any task if `task` is None.
 
     Raises:
-        ValueError: If the file is invalid, of an unknown version, or of another task. The message
-            is one line.
+        ValueError: If the file is missing, invalid, of an unknown version, or not of `task`. The
+            message is one line.
     """
     data = read_file(Path(path))
     tensors, metadata = parse_tensors(data, path)
@@ -157,17 +155,13 @@ def read_info(path: str | Path) -> ActorInfo:
     """Read only the metadata of a checkpoint.
 
     Raises:
-        ValueError: If the file is not an actor checkpoint of this version.
+        ValueError: If the file is missing or not an actor checkpoint of this version.
     """
     return parse_metadata(parse_tensors(read_file(Path(path)), path)[1], path)
 
 
 def load(path: str | Path, task: str | None = None) -> tuple[Actor, ActorInfo]:
-    """Load an actor as a torch module, and its metadata; arguments as `read`.
-
-    Raises:
-        ValueError: If the file is invalid, of an unknown version, or of another task.
-    """
+    """Load a torch actor and its metadata; ValueError if the file is invalid or not of `task`."""
     from policy_node.policies.actor import Actor
 
     checkpoint = read(path, task)
@@ -185,7 +179,7 @@ def checkpoint_hash(path: str | Path) -> str:
 
 
 def parse_metadata(metadata: dict[str, str], path: str | Path) -> ActorInfo:
-    """Return the checked metadata of a checkpoint or ONNX file.
+    """Return the checked metadata of a checkpoint or ONNX file; errors name its `path`.
 
     Raises:
         ValueError: If a field is missing or invalid, or does not fit the task or the version.
@@ -272,9 +266,9 @@ def _check_tensors(
 
 
 def _of_type(kind: type, name: str) -> Callable[[object], Any]:
-    """Return a function that returns values of the type `kind` and raises TypeError for others.
+    """Return a function that returns its argument, or raises TypeError if its type is not `kind`.
 
-    Booleans are not numbers. `name` is the name of the type in the error.
+    Booleans are not numbers. The error calls the type `name`.
     """
 
     def read_value(value: object) -> Any:

@@ -60,7 +60,7 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def export(source: Path, target: Path) -> float:
-    """Write a checkpoint as ONNX and compare the actions; after an error, no file is written.
+    """Write a checkpoint as an ONNX file; after an error, no file is written.
 
     Returns:
         The largest difference between actions of checkpoint and ONNX file on random observations.
@@ -109,7 +109,7 @@ def export(source: Path, target: Path) -> float:
 
 
 def _whole_network(actor: Actor) -> Any:
-    """Return a torch module that maps observation and goal to the action, with normalisation."""
+    """Return a torch module that maps raw observations and goals (batch, size) to actions."""
     from torch import Tensor, nn
 
     class WholeNetwork(nn.Module):

@@ -28,7 +28,7 @@ LARGEST_HEADER = 2**20
 
 
 def read_file(path: Path, largest: int = LARGEST_POLICY) -> bytes:
-    """Read a regular file.
+    """Return the contents of a regular file.
 
     Raises:
         ValueError: If the file is missing, unreadable, not regular or larger than `largest` bytes.
@@ -104,7 +104,7 @@ def to_json(values: Mapping[str, Any]) -> bytes:
 
 
 def to_csv(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> bytes:
-    """Return the contents of a CSV file."""
+    """Return the contents of a CSV file with `columns` as its header line."""
     file = io.StringIO()
     writer = csv.writer(file, lineterminator='\n')
     writer.writerow(columns)
@@ -120,7 +120,7 @@ def sha256(data: bytes) -> str:
 def write_tensors(
     path: str | Path, tensors: Mapping[str, ArrayLike], metadata: dict[str, str]
 ) -> None:
-    """Write arrays, or torch tensors on the CPU, as a safetensors file."""
+    """Write arrays, or torch tensors on the CPU, by name to a safetensors file."""
     write_file(Path(path), tensor_bytes(tensors, metadata))
 
 
@@ -140,10 +140,10 @@ def read_tensors(path: str | Path) -> tuple[dict[str, NDArray[Any]], dict[str, s
 
 
 def parse_tensors(data: bytes, path: str | Path) -> tuple[dict[str, NDArray[Any]], dict[str, str]]:
-    """Return the arrays and the metadata of a safetensors file.
+    """Return the arrays and the metadata in the contents of a safetensors file.
 
     Raises:
-        ValueError: If the contents are invalid, or the header is larger than 1 MiB.
+        ValueError: If `data` is invalid or its header exceeds 1 MiB; the error names `path`.
     """
     end = 8 + int.from_bytes(data[:8], 'little')
     try:

@@ -60,7 +60,7 @@ class RelativeGoal:
     ignores_z_rotation: bool = False
 
     def inputs(self, seen: Seen, normalized: Seen) -> Array:
-        """Return the network inputs: normalised observation and goal, then `difference`.
+        """Return normalised observation, normalised goal and `difference`, concatenated.
 
         Args:
             seen: Observation and goal, (..., size) each, in the units of the task.
@@ -76,7 +76,7 @@ class RelativeGoal:
         return [*range(observation_size, observation_size + 3), *range(size - 3, size)]
 
     def difference(self, observation: Array, goal: Array) -> Array:
-        """Return the network inputs for the difference between desired and achieved goal.
+        """Return inputs for the difference of the goals; arguments are in the task's units.
 
         The shape is (..., 6) for a point, (..., 15) for fingertips and (..., 10) for a pose.
         """
@@ -100,9 +100,9 @@ class SymmetricObject:
 
     A cube looks the same on another face. An egg or a pen looks the same when turned about its axis
     or upside down. Polynomials of the rotation matrix replace the object's quaternion. They are
-    invariant under the symmetry and determine the rotation up to it: for a cube the sum of the
-    fourth tensor powers of its three axes, for a body of revolution the second power of its axis.
-    The angular velocity is in the world frame. The goal appears only in `RelativeGoal.difference`.
+    equal for rotations that look the same and differ for others. A cube has the sum of the fourth
+    tensor powers of its three axes, a body of revolution the second tensor power of its axis. The
+    angular velocity is in the world frame. The desired goal appears only in `relative.difference`.
 
     Attributes:
         symmetry: `cube`, or `revolution` for a body of revolution that can be turned upside down.
@@ -112,7 +112,7 @@ class SymmetricObject:
     symmetry: str
 
     def inputs(self, seen: Seen, normalized: Seen) -> Array:
-        """Return the network inputs, with symmetric rotation, angular velocity and goal difference.
+        """Return the network inputs; the class docstring describes the replaced values.
 
         Args:
             seen: Observation and goal, (..., size) each, in the units of the task. The observation
@@ -143,10 +143,11 @@ GoalFeatures = RelativeGoal | SymmetricObject
 
 
 def goal_features(kind: str, spec: TaskSpec) -> GoalFeatures | None:
-    """Return the maker of network inputs of a `kind`: `plain`, `relative` or `symmetric`.
+    """Return the object that makes the network inputs of a task, or None for `plain`.
 
-    It is None for `plain`, the unchanged observation and goal. ValueError for another kind, or for
-    `symmetric` if the goal of the task is no object pose.
+    `plain` inputs are observation and goal. `relative` gives a `RelativeGoal`, `symmetric` a
+    `SymmetricObject`. Another `kind` raises ValueError; so does `symmetric` if the goal of the task
+    is no object pose.
     """
     if kind not in GOAL_FEATURES:
         raise ValueError(f'goal_features {kind!r}; allowed: {", ".join(GOAL_FEATURES)}')
@@ -177,7 +178,7 @@ def _rotation_matrix(quaternion: Array) -> Array:
 
 
 def _cube_shape(rotation: Array) -> Array:
-    """Return the 15 distinct sums of a_i a_j a_k a_l over a cube's axes a, scaled to about +-1."""
+    """Return 15 sums of a_i a_j a_k a_l over the columns a of matrices, scaled to about +-1."""
     second = _second_powers(rotation)
     xx, xy, xz, yy, yz, zz = (second[..., i, :] for i in range(6))
     products = [xx * second[..., i, :] for i in range(6)]
@@ -190,7 +191,7 @@ def _cube_shape(rotation: Array) -> Array:
 
 
 def _axis_shape(rotation: Array) -> Array:
-    """Return the 6 distinct products a_i a_j of the z axis a, scaled to about +-1."""
+    """Return 6 products a_i a_j of the last column a of matrices, scaled to about +-1."""
     second = _second_powers(rotation[..., 2:]).squeeze(-1)
     return 1.5 * (second - _like(second, [1 / 3, 0, 0, 1 / 3, 0, 1 / 3]))
 
@@ -210,7 +211,7 @@ def _relative_quaternion(achieved: Array, goal: Array) -> tuple[Array, Array]:
 
 
 def _axis_turn(achieved: Array, goal: Array) -> tuple[Array, Array]:
-    """Return dot (..., 1) and cross product (..., 3) of the z axes of two quaternions wxyz."""
+    """Return dot (..., 1) and cross product (..., 3) of the z axes of two rotations wxyz."""
     first, second = _z_axis(achieved), _z_axis(goal)
     return (first * second).sum(-1)[..., None], _cross(first, second)
 

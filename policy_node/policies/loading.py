@@ -51,7 +51,7 @@ def actor_path(name_or_path: str | Path, others: Sequence[str] = ()) -> Path:
 
     Args:
         name_or_path: Name of a shipped actor, or a path.
-        others: Further names that the caller accepts, listed in the error message.
+        others: Names that the caller accepts besides; only the error message lists them.
 
     Raises:
         ValueError: If no such actor or file exists. The message lists the shipped actors, or
@@ -97,7 +97,7 @@ POLICY_NAMES = (
 
 
 class TaskMissing(ValueError):
-    """Raised if a policy is loaded without a task, and it does not name one itself."""
+    """Raised if the caller gives no task for a policy that does not name its task."""
 
 
 def load_actor(name_or_path: str | Path, task: str | None = None) -> Actor:
@@ -163,7 +163,7 @@ def _untrained(name: str, task: str | None) -> LoadedPolicy:
 
 
 def _shipped(task: str | None, kind: str) -> Path:
-    """Return the file of a task's shipped actor of a kind: '' (the usual one) or `robust`."""
+    """Return the file of a task's shipped actor, kind '' or `robust`; ValueError if missing."""
     what = f'{kind} actor' if kind else 'actor'
     task, shipped = _require_task(f'the shipped {what}', task), shipped_actors()
     if shipped_name(task, kind) not in shipped:
@@ -176,7 +176,7 @@ def _shipped(task: str | None, kind: str) -> Path:
 
 
 def _read(path: Path, task: str | None, trust: bool) -> LoadedPolicy:
-    """Load a policy file according to its suffix; import only the libraries of this format."""
+    """Load a `.onnx` file, a `.zip` file (only with `trust`) or, for other names, a checkpoint."""
     if path.suffix == '.onnx':
         from policy_node.policies.onnx import load_onnx
 
@@ -205,7 +205,7 @@ def _require_task(name: str, task: str | None) -> str:
 
 
 class _FunctionPolicy(MemorylessPolicy):
-    """A policy made of a function from one observation to one action; it splits batches."""
+    """A policy that calls a function from one observation to one action, once for each row of a batch."""
 
     def __init__(self, function: Callable[[Observation], Any]) -> None:
         self._function = function
@@ -244,7 +244,10 @@ def working_directory_first() -> Iterator[None]:
 
 
 def _load_python(name: str, task: str) -> LoadedPolicy:
-    """Import a module, also from the working directory; call its function with the task."""
+    """Import '<module>:<function>', also from the working directory; call it with the task.
+
+    Raise ValueError if this fails, or if the result is neither a policy nor a function.
+    """
     module_name, _, function_name = name.partition(':')
     try:
         with working_directory_first():

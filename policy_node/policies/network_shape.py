@@ -27,7 +27,6 @@ class NetworkShape:
 
     Attributes:
         observation_size: Length of `observation`.
-        goal_size: Length of `desired_goal`.
         layer_norm: Whether a LayerNorm precedes each activation.
         goal_features: Function for the network inputs; None uses observation and goal unchanged.
         past_actions: Number of past actions among the inputs, after the observation.
@@ -67,8 +66,9 @@ class NetworkShape:
         """Return the network inputs (..., feature_size), NumPy or torch.
 
         Args:
-            given: Observation with past actions (..., input_size), and goal (..., goal_size).
-            normalized: The same observation and goal, normalised.
+            given: Observation with past actions (..., input_size), and goal (..., goal_size), in
+                the units of the task. Only `goal_features` use them.
+            normalized: The same two arrays, normalised.
         """
         if self.goal_features is None:
             return concatenate(*normalized)
@@ -77,9 +77,9 @@ class NetworkShape:
         return concatenate(inputs, seen[..., size:]) if self.past_actions else inputs
 
     def hidden_names(self) -> list[tuple[str, str]]:
-        """Return the names in an `Actor` of the modules (hidden layer, its LayerNorm), in order.
+        """Return the module names in an `Actor` of each hidden layer and its LayerNorm, in order.
 
-        The second name has no meaning without `layer_norm`.
+        Without `layer_norm`, ignore the second name of each pair.
         """
         stride = 3 if self.layer_norm else 2
         places = range(0, stride * len(self.hidden_sizes), stride)
@@ -108,9 +108,9 @@ class NetworkPolicy:
     shape: NetworkShape
 
     def act(self, seen: NDArray[np.float32], goal: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return actions (..., action_size) for `seen` and `goal`.
+        """Return actions (..., action_size) for inputs in the units of the task.
 
-        `seen` contains the observation and past actions, (..., input_size).
+        `seen`, (..., input_size), is the observation with past actions. `goal` is (..., goal_size).
         """
         raise NotImplementedError
 
@@ -125,8 +125,8 @@ class NetworkPolicy:
 
         Args:
             observation: `observation` (..., observation_size) and `desired_goal` (..., goal_size)
-                in the units of the task. One of the two may serve a whole batch. Other keys are
-                ignored.
+                in the units of the task. If only one has batch axes, the other serves the whole
+                batch. Other keys are ignored.
             state: State that the last call returned; None at the start of an episode. Only an
                 actor with past actions uses it.
             episode_start: Booleans (...,), True where an episode starts.

@@ -47,7 +47,7 @@ class NumpyActor(NetworkPolicy):
         self._values = {name: values.astype(np.float64) for name, values in tensors.items()}
 
     def act(self, seen: NDArray[np.float32], goal: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return actions (..., action_size) for `seen` (observation, past actions) and `goal`."""
+        """Return actions (..., action_size) in -1 ... 1; `seen` is observation and past actions."""
         # Rounded to float32 first, as in training.
         given = seen.astype(np.float64), goal.astype(np.float64)
         normalized = (
@@ -92,7 +92,7 @@ def load_checkpoint(path: Path, task: str | None = None) -> LoadedPolicy:
     """Load a checkpoint for running.
 
     Raises:
-        ValueError: If the file is invalid, of an unknown version, or of another task.
+        ValueError: If the file is invalid, of an unknown version, or not of the given `task`.
     """
     found = checkpoint.read(path, task)
     actor = NumpyActor(found.info.shape, found.tensors)

@@ -41,11 +41,11 @@ _TRIAL_TIMEOUT = 30.0
 
 
 class OnnxActor(NetworkPolicy):
-    """Run an ONNX file on one thread.
+    """An actor that runs an ONNX file with the contents `data` on one thread.
 
     Raises:
         ValueError: If onnxruntime is missing, or the file is invalid or does not fit its task. The
-            message is one line.
+            message is one line with `path`.
     """
 
     def __init__(self, data: bytes, path: Path) -> None:
@@ -75,10 +75,11 @@ class OnnxActor(NetworkPolicy):
 
 
 def load_onnx(path: Path, task: str | None = None) -> LoadedPolicy:
-    """Load an ONNX file for running.
+    """Load an ONNX file as a policy.
 
     Raises:
-        ValueError: If the file is invalid, needs too much memory or time, or has another task.
+        ValueError: If onnxruntime is missing, or the file is invalid, needs too much memory or
+            time, or has another task than `task` (None allows all).
     """
     data = read_file(path)
     if _EXTERNAL.search(data):
@@ -113,7 +114,7 @@ def _session(data: bytes, path: Path) -> Any:
 
 
 def _try_out(data: bytes, path: Path) -> None:
-    """Run `data`, the file `path`, with limited memory and time; raise ValueError if it fails."""
+    """Run the ONNX file `data` in a process with limited memory and time; ValueError on failure."""
     # -P: do not import modules of the working directory.
     command = [sys.executable, '-P', '-m', __name__, str(path)]
     environment = os.environ | {'PYTHONPATH': os.pathsep.join(p or os.getcwd() for p in sys.path)}
@@ -138,7 +139,7 @@ def _try_out(data: bytes, path: Path) -> None:
 
 
 def _trial(path: Path) -> int:
-    """Run the ONNX file on stdin, named `path` in errors, once; return 0, or 1 after an error."""
+    """Run the ONNX file on stdin once; return 0, or print an error with `path` and return 1."""
     data = sys.stdin.buffer.read()
     try:
         _require_onnxruntime(path)

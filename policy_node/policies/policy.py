@@ -65,11 +65,7 @@ class LoadedPolicy:
     is_bounded: bool = False
 
     def require_rate(self, control_hz: float) -> None:
-        """Reject a robot with another action frequency, Hz.
-
-        Raises:
-            ValueError: If the policy was trained at another frequency.
-        """
+        """Raise ValueError if the policy was trained at another frequency than `control_hz`, Hz."""
         if self.control_hz not in (None, control_hz):
             raise ValueError(
                 f'{self.description} was trained at {self.control_hz:g} Hz; the robot runs at '
@@ -90,7 +86,7 @@ class LoadedPolicy:
 
         Raises:
             PolicyError: If the policy fails, or returns anything but finite numbers of the right
-                shape.
+                shape; if `is_bounded`, also outside [-1, 1].
         """
         try:
             shape = _action_shape(observation, TASKS[self.task].robot.action_size)
@@ -132,7 +128,7 @@ class MemorylessPolicy:
         episode_start: Any = None,
         deterministic: bool = True,
     ) -> tuple[NDArray[Any], None]:
-        """Return actions as `Policy.predict` does, without a state."""
+        """Return the actions of `act`, and None as state."""
         del state, episode_start, deterministic
         return self.act(observation), None
 
@@ -142,7 +138,7 @@ _ACTION_STREAM = 1
 
 
 class RandomPolicy(MemorylessPolicy):
-    """Policy of uniformly random actions, which are equal for equal seeds."""
+    """Policy of uniformly random actions, drawn with `seed` unless `start` gives other seeds."""
 
     def __init__(self, action_size: int, seed: int = 0) -> None:
         self._action_size = action_size
@@ -228,7 +224,7 @@ def observation_and_goal(
 def past_before(
     state: Any, episode_start: Any, leading: tuple[int, ...], size: int
 ) -> NDArray[np.float32]:
-    """Return the past actions (`*leading`, size) before a prediction, newest first.
+    """Return the past actions (`*leading`, size) as input of a prediction, newest first.
 
     Args:
         state: State that the last prediction returned; None at the start of all episodes.
@@ -237,7 +233,7 @@ def past_before(
         size: Number of past actions times the action size.
 
     Raises:
-        ValueError: If the state belongs to another batch or policy.
+        ValueError: If `state` has another shape, as from another batch or policy.
     """
     past = np.zeros((*leading, size), np.float32)
     if state is None:

@@ -51,7 +51,7 @@ class StableBaselines3Policy:
     """The policy of a Stable-Baselines3 model; by default it acts without exploration noise.
 
     Args:
-        statistics: The `VecNormalize` that the model was trained with, or None.
+        statistics: The `VecNormalize` of the training, to normalise observations, or None.
     """
 
     def __init__(self, policy: Any, statistics: Any = None) -> None:
@@ -65,7 +65,7 @@ class StableBaselines3Policy:
         episode_start: Any = None,
         deterministic: bool = True,
     ) -> tuple[NDArray[Any], Any]:
-        """Return actions (..., action size) in [-1, 1], and the state for the next call."""
+        """Return actions (..., action size) in [-1, 1] and state, as `BasePolicy.predict` does."""
         seen: Any = dict(observation)
         if self._statistics is not None:
             seen = self._statistics.normalize_obs(seen)
@@ -118,7 +118,7 @@ def _statistics_file(path: Path) -> Path | None:
 
 
 def _statistics(file: Path, content: bytes) -> Any:
-    """Load the `VecNormalize` of a training run; this can run code that the file contains."""
+    """Return the `VecNormalize` pickled in `content`, the bytes of `file`; this can run code."""
     try:
         statistics = pickle.loads(content)
     except Exception as error:
@@ -130,7 +130,7 @@ def _statistics(file: Path, content: bytes) -> Any:
 
 
 def _algorithm(data: bytes, path: Path) -> Any:
-    """Return the algorithm class that matches the policy class named in a model file."""
+    """Return the class of the algorithm that saved a model, such as `SAC`, or raise ValueError."""
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as file:
             settings = json.loads(file.read('data'))

@@ -131,7 +131,7 @@ def _evaluate(
 ) -> tuple[EpisodeOutcomes, int]:
     """Evaluate the policy; return the outcomes and the exit code of the command.
 
-    After Ctrl-C, the outcomes are those of the batches of episodes that have ended.
+    After Ctrl-C, these are the outcomes of the batches that have ended and `EXIT_INTERRUPTED`.
 
     Raises:
         KeyboardInterrupt: After Ctrl-C, if no batch of episodes has ended yet.

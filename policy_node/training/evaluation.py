@@ -1,4 +1,4 @@
-"""Evaluate policies on fresh episodes, without noise: outcomes, summary and table."""
+"""Evaluate policies on fresh episodes, without noise; summarise and print the outcomes."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class EpisodeOutcomes:
         return EpisodeOutcomes(*(np.concatenate(pair) for pair in pairs))
 
     def first(self, count: int) -> EpisodeOutcomes:
-        """Return the first `count` episodes."""
+        """Return the first `count` episodes, or all if there are fewer."""
         return EpisodeOutcomes(*(getattr(self, n)[:count] for n in EpisodeOutcomes.__slots__))
 
 
@@ -119,7 +119,11 @@ def compare(
 
 
 def summarize(outcomes: EpisodeOutcomes) -> dict[str, Any]:
-    """Return measures by name: success rates with intervals, mean return, those of `diagnose`."""
+    """Return the measures of an evaluation by name, as JSON values.
+
+    `success_gymnasium`, `success_paper` and `touched` are rates, each with an `_interval_95`. The
+    others are counts, the first seed, the mean return and the result of `diagnose`.
+    """
     episodes = len(outcomes)
     summary: dict[str, Any] = {'episodes': episodes, 'first_seed': int(outcomes.seed[0])}
     for name in ('success_gymnasium', 'success_paper', 'touched'):
@@ -136,10 +140,10 @@ def diagnose(outcomes: EpisodeOutcomes) -> dict[str, float]:
 
     Returns:
         `stay`: probability of success at the next tick, given success at this one. `long_way`:
-        success rate of the episodes that require a rotation by more than pi. `long_way_share`:
-        share of these episodes. `dropped`: share of episodes that end with the object below the
-        palm. `distance`, `rotation`: median distance (m) and rotation (rad) to the goal at the end.
-        Measures that do not apply to the task or to any episode are missing.
+        success rate (rule `gymnasium`) of the episodes that require a rotation by more than pi.
+        `long_way_share`: their share. `dropped`: share of episodes that end with the object below
+        the palm. `distance`, `rotation`: median distance (m) and rotation (rad) to the goal at the
+        end. Measures that do not apply to the task or to any episode are missing.
     """
     found: dict[str, float] = {}
     if outcomes.ticks_reached.any():
@@ -156,11 +160,9 @@ def diagnose(outcomes: EpisodeOutcomes) -> dict[str, float]:
 
 
 def run_episodes(simulation: Simulation, policy: Policy, seeds: list[int]) -> EpisodeOutcomes:
-    """Run one episode in each simulation, without noise, and return the outcomes.
+    """Run one episode in each simulation, with deterministic actions, and return the outcomes.
 
-    Args:
-        simulation: The simulations. Success at the last step is computed by both success rules.
-        seeds: One seed per simulation. An episode does not depend on the others of the batch.
+    `seeds` has one seed per simulation. An episode does not depend on the others of the batch.
     """
     observation = simulation.reset(seed=seeds)
     count = simulation.num_envs
@@ -201,7 +203,7 @@ def run_episodes(simulation: Simulation, policy: Policy, seeds: list[int]) -> Ep
 
 
 def _long_way(spec: TaskSpec, observation: dict[str, NDArray[np.float64]]) -> NDArray[np.bool_]:
-    """Return (episodes,): True if the quaternions of goal and object have opposite signs."""
+    """Return `EpisodeOutcomes.long_way`, (episodes,), from the first observations of episodes."""
     achieved, desired = observation['achieved_goal'], observation['desired_goal']
     if spec.goal is not GoalKind.POSE:
         return np.zeros(len(achieved), np.bool_)
@@ -219,8 +221,8 @@ def evaluate(
 
     Args:
         simulation: The simulations; the result does not depend on their number.
-        episodes: Number of episodes to run, unless `hopeless` ends the evaluation early.
-        hopeless: Called after each batch with all outcomes so far; True ends the evaluation early.
+        hopeless: Called after each batch except the last, with all outcomes so far. If it returns
+            True, the evaluation ends, with fewer than `episodes` outcomes.
 
     Raises:
         ValueError: If `episodes` is less than 1.
@@ -244,7 +246,7 @@ EVALUATION_SEED = 1_000_000_000
 
 
 def training_seeds(sequence: np.random.SeedSequence, count: int) -> list[int]:
-    """Return `count` seeds for training episodes from `sequence`; evaluations use other seeds."""
+    """Return `count` training seeds drawn from `sequence`, all below the seeds of evaluations."""
     return [int(seed) % EVALUATION_SEED for seed in sequence.generate_state(count) >> 2]
 
 

@@ -1,7 +1,7 @@
 """Log episodes of a policy in the batched simulation, without ROS.
 
-The files are byte-compatible with those of `sim_node`. The same command line logs the same
-messages again.
+The files have the same format as those of `sim_node`. The same command line logs the same
+messages again, byte for byte.
 """
 
 from __future__ import annotations
@@ -118,7 +118,7 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _warn_of_repeated_seeds(options: argparse.Namespace, task: str) -> None:
-    """Warn if the output folder already contains episodes with the seeds to generate.
+    """Warn if the output folder contains episodes of `task` with seeds of the new episodes.
 
     Training would use such episodes twice.
     """

@@ -86,7 +86,7 @@ class Workers:
     Attributes:
         rank: Index of this worker; worker 0 writes logs and checkpoints.
         world_size: Number of workers.
-        device: Device on which messages are sent: the GPU with nccl, else the CPU.
+        device: Device of the tensors that workers exchange: the GPU with nccl, else the CPU.
     """
 
     rank: int = 0
@@ -99,7 +99,7 @@ class Workers:
         return self.rank == 0
 
     def share(self, total: int) -> int:
-        """Return this worker's part of a total, rounded up."""
+        """Return `total` divided by the number of workers, rounded up."""
         return -(-total // self.world_size)
 
     def sum(self, values: Tensor) -> Tensor:

@@ -62,7 +62,7 @@ def load_chosen_policy(options: argparse.Namespace) -> LoadedPolicy:
 
 @contextmanager
 def policy_errors() -> Iterator[None]:
-    """Turn a `PolicyError` in the block into a `CommandError`, which ends the command."""
+    """Turn a `PolicyError` in the `with` block into a `CommandError`, which ends the command."""
     try:
         yield
     except PolicyError as error:
@@ -91,7 +91,7 @@ def make_chosen_simulation(options: argparse.Namespace, loaded: LoadedPolicy) ->
 def require_writable(file: Path) -> None:
     """Create the folder of `file` and check that the file can be written.
 
-    Commands call this before long work.
+    The file is not created or changed. Commands call this before long work.
 
     Raises:
         UsageError: If the file cannot be written.

@@ -53,7 +53,7 @@ class Run:
         return best if best.is_file() else self.folder / LATEST_FILE
 
     def progress(self) -> list[dict[str, float]]:
-        """Return a row per cycle: `env_steps`, `train_success`, `eval_success` if evaluated, ..."""
+        """Return a row of `progress.csv` per cycle; values that were not measured are missing."""
         return read_progress(self.folder / PROGRESS_FILE)
 
 
@@ -127,7 +127,7 @@ def train(
 
 @contextlib.contextmanager
 def _torch_restored() -> Iterator[None]:
-    """After the block, restore the number of threads and the random state of torch."""
+    """Return a context that restores torch's number of threads and random state at its end."""
     threads = torch.get_num_threads()
     try:
         with torch.random.fork_rng():

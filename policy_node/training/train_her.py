@@ -135,7 +135,7 @@ def _read_experience(config: TrainConfig, directory: Path | None) -> Episodes | 
 
     Raises:
         ValueError: If a setting, such as algorithm `ppo`, cannot use logged episodes, no episode is
-            usable, or the replay is too small.
+            usable, or the episodes do not all fit into the replay.
     """
     if directory is None:
         return None

@@ -75,7 +75,7 @@ def measure(run: Path, episodes: int) -> list[Comparison]:
 def _play(
     simulation: Simulation, learner: ActorCritic, compute_reward: RewardFunction
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Run an episode in each simulation; return values and rewards, each (ticks, episodes)."""
+    """Run an episode in each simulation; return critic values and rewards (ticks, episodes)."""
     count = simulation.num_envs
     observation = simulation.reset(seed=[FIRST_SEED + index for index in range(count)])
     values, rewards = [], []

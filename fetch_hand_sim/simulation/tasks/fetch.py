@@ -50,15 +50,16 @@ class FetchConfig:
     """Differences between the Fetch tasks; lengths in m.
 
     Attributes:
-        start: Initial positions of robot0:slide0, slide1, slide2.
-        object_start: Initial qpos of the object; None without an object.
+        asset: MJCF file, below the assets folder of Gymnasium-Robotics.
+        start: Initial positions of the joints robot0:slide0, slide1 and slide2.
+        object_start: Initial qpos (7,) of the object; None without an object.
         block_gripper: Whether each step shuts the fingers. At the reset they are open by less than
             1 mm, as in Gymnasium-Robotics.
         gripper_extra_height: Added to the start height of the gripper.
         object_range: Half width of the square in which the object starts.
-        target_range: Half width of the cube that contains the goals.
-        target_offset: Added to goals.
-        target_in_the_air: Whether half of the goals are above the table.
+        target_range: Half width of the cube around the gripper's start in which goals are drawn.
+        target_offset: Vector that is added to goals of tasks with an object.
+        target_in_the_air: Whether half of the goals are above the table, by up to 0.45 m.
     """
 
     asset: str
@@ -128,7 +129,7 @@ class FetchTask(Task):
         gripper_start: (3,) position of the gripper at a reset, m, world.
         object_height: Height of the object's centre at a reset, m; only with an object.
         gripper_rotation: (N, 4) present rotation of the gripper, wxyz; a read-only view.
-        lead_scale: Factor of the gripper offset at rates other than 25 Hz; 1 if timing is `ticks`.
+        lead_scale: Result of the function `lead_scale`; 1 if `timing` of the batch is `ticks`.
     """
 
     def __init__(
@@ -161,7 +162,7 @@ class FetchTask(Task):
         self.batch.state[:] = self.start_state
 
     def _add_site(self, name: str, site: int) -> None:
-        """Add the sensors `<name>_pose` (N, 7) and `<name>_twist` (N, 6) of a site; world axes."""
+        """Add sensors `<name>_pose` (N, 7) and `<name>_twist` (N, 6; linear first) of a site."""
         turn = self.model.site_quat[site].copy()
         is_aligned = bool((turn == [1.0, 0.0, 0.0, 0.0]).all())
         position: Array = self.output('site_xpos')[:, site]
@@ -207,7 +208,7 @@ class FetchTask(Task):
         return self.config.asset
 
     def reset(self, ids: Ids, generators: Generators) -> Array:
-        """Restore the start state of simulations `ids`, place objects and return new goals."""
+        """Restore the start state of simulations `ids`, place objects and return goals (n, 3)."""
         self.batch.state[ids] = self.start_state
         if self.object_qpos is not None:
             places = [self._sample_object_place(generator) for generator in generators]
@@ -225,7 +226,7 @@ class FetchTask(Task):
         return place
 
     def sample_goal(self, index: int, generator: np.random.Generator) -> Array:
-        """Draw a goal near the gripper's start position; with an object, on the table or above."""
+        """Draw a goal (3,), m, near the gripper's start; with an object, on or above the table."""
         config = self.config
         reach = config.target_range
         goal = self.gripper_start + generator.uniform(-reach, reach, size=3)
@@ -237,9 +238,10 @@ class FetchTask(Task):
         return np.asarray(goal)
 
     def apply_commands(self, commands: NDArray[np.floating]) -> None:
-        """Set the mocap target, 0.05 m per unit of command at 25 Hz, and the finger actuators.
+        """Set the mocap target and the finger actuators for commands (N, 4).
 
-        The offset is scaled in the floating type of the command, as in Gymnasium-Robotics.
+        One unit moves the target 0.05 m at 25 Hz. The offset is scaled in the floating type of the
+        command, as in Gymnasium-Robotics.
         """
         offset = commands[:, :3] * commands.dtype.type(GRIPPER_STEP * self.lead_scale)
         if self.model.nu:
@@ -248,18 +250,18 @@ class FetchTask(Task):
         self.move_gripper(offset, self.gripper_rotation + _GRIPPER_ROTATION)
 
     def move_gripper(self, offset: NDArray[np.floating], rotation: Array) -> None:
-        """Set the mocap target: offset (N, 3) from the gripper, m, and rotation (N, 4) wxyz."""
+        """Set the mocap target: gripper position plus `offset` (N, 3), m, and `rotation` (N, 4)."""
         self._mocap_pos[:, 0] = self._gripper_xpos + offset
         self._mocap_quat[:, 0] = rotation
 
     def resting_commands(self) -> Array:
-        """Return zeros: gripper and fingers stay where they are."""
+        """Return zeros (N, action size), for which gripper and fingers stay where they are."""
         return np.zeros((self.batch.nsim, self.spec.robot.action_size))
 
     def _finger_controls(self, fingers: NDArray[np.floating] | float) -> Array:
-        """Return actuator controls (N, actuators) for finger commands (N, 1) or one number.
+        """Return actuator controls (N, actuators) for finger commands (N, 1), or for one command.
 
-        A position actuator gets the command plus the present finger position, as its target.
+        A position actuator gets the command plus the present finger position, others the command.
         """
         model = self.model
         controls = np.broadcast_to(fingers, self._ctrl.shape).astype(np.float64)
@@ -271,8 +273,8 @@ class FetchTask(Task):
     def step(self) -> None:
         """Advance one tick; then shut the fingers of a blocked gripper and run a forward pass.
 
-        The pass computes positions only, unless the batch has `keeps_data`. Efforts need no pass,
-        because models with a blocked gripper have no actuators.
+        The pass updates poses; in a batch with `keeps_data`, it updates all derived values. Efforts
+        need no pass, because models with a blocked gripper have no actuators.
         """
         try:
             super().step()
@@ -284,16 +286,16 @@ class FetchTask(Task):
 
 
 def lead_scale(control_hz: float) -> float:
-    """Return the factor of the gripper offset per action that gives the gripper speed of 25 Hz."""
+    """Return the factor on gripper offsets that gives the gripper the same speed as at 25 Hz."""
     return _steady_speed(DEFAULT_CONTROL_HZ) / _steady_speed(control_hz)
 
 
 def _steady_speed(control_hz: float) -> float:
     """Return the mean speed of the gripper per metre of offset, 1/s, for constant commands.
 
-    The weld to the mocap body is a critically damped spring of frequency w. A period T starts at
-    distance 1 and with speed w u towards the mocap body; after it, the distance is
-    (1 - (u - 1) x) exp(-x), x = w T. In the steady state, u is equal at both ends of a period.
+    The weld to the mocap body is a critically damped spring of frequency w. A tick of duration T
+    starts at distance 1 with speed w u towards the mocap body; at its end, the distance is
+    (1 - (u - 1) x) exp(-x), x = w T. In the steady state, u is equal at both ends of a tick.
     """
     x = 1.0 / (control_hz * _TIME_CONSTANT)
     decay = math.exp(-x)

@@ -25,7 +25,7 @@ from msgs_spec.tasks import TaskSpec
 
 
 def load_hand_model(asset: str) -> mujoco.MjModel:
-    """Compile a hand model, tuned to step faster along the same trajectories."""
+    """Compile an MJCF asset such as `hand/reach.xml`, tuned for speed with the same trajectories."""
     mjcf = load_spec(asset)
     list_geom_pairs(mjcf)
     model = mjcf.compile()
@@ -39,7 +39,7 @@ def fingertip_sites(model: mujoco.MjModel) -> NDArray[np.intp]:
 
 
 class HandTask(Task):
-    """Base of HandReach and the manipulation tasks: actions, resting commands, fingertips."""
+    """Base of HandReach and the manipulation tasks; converts actions, measures fingertip poses."""
 
     def __init__(self, spec: TaskSpec, model: mujoco.MjModel, batch: BatchConfig) -> None:
         super().__init__(spec, model, batch)
@@ -66,7 +66,7 @@ class HandTask(Task):
             self._scaled_robot = replace(self.spec.robot, command=command)
 
     def commands_from_actions(self, actions: NDArray[np.floating]) -> NDArray[np.floating]:
-        """Map actions (N, 20) in [-1, 1] to joint angles (N, 20), rad."""
+        """Map actions (N, 20) in [-1, 1] linearly to the range of joint angles (N, 20), rad."""
         return command_from_action(self._scaled_robot, actions)
 
     def apply_commands(self, commands: NDArray[np.floating]) -> None:
@@ -74,11 +74,11 @@ class HandTask(Task):
         self._ctrl[:] = commands
 
     def resting_commands(self) -> Array:
-        """Return the present targets of the actuators (N, 20), rad."""
+        """Return the present targets of the position actuators, (N, 20), rad."""
         return self._ctrl.copy()
 
     def _fingertip_poses(self) -> Array:
-        """Return five fingertip poses (N, 35): position, m, and body quaternion, wxyz, of each."""
+        """Return five fingertip poses, world, (N, 35); a pose is position, m, and quaternion, wxyz."""
         positions = self._site_xpos[:, self._fingertip_sites]
         quaternions = self._xquat[:, self._fingertip_bodies]
         return np.concatenate([positions, quaternions], axis=2).reshape(self.batch.nsim, -1)
@@ -124,8 +124,8 @@ class HandReachTask(HandTask):
     """HandReach, the task of moving the fingertips to given positions.
 
     Attributes:
-        start_fingertips: (5, 3) positions of the fingertips at a reset, m, world.
-        palm: (3,) position of the palm, m, world.
+        start_fingertips: (5, 3) positions of the fingertips in the initial pose, m, world.
+        palm: (3,) position of the palm in the initial pose, m, world.
     """
 
     ASSET = 'hand/reach.xml'
@@ -143,13 +143,16 @@ class HandReachTask(HandTask):
         self.batch.state[:] = self.start_state
 
     def reset(self, ids: Ids, generators: Generators) -> Array:
-        """Restore the initial pose of the simulations `ids`; return new goals (n, 15), m."""
+        """Restore the initial pose of the simulations `ids`, (n,); return new goals (n, 15), m."""
         self.batch.state[ids] = self.start_state
         self.batch.forward(ids)
         return self.sample_goals(ids, generators)
 
     def sample_goal(self, index: int, generator: np.random.Generator) -> Array:
-        """Draw a goal where thumb and one finger meet, or with probability 0.1 the initial pose."""
+        """Draw a goal (15,), m, world, in which the thumb and a random finger meet.
+
+        The other fingertips keep their initial positions. With probability 0.1, all keep them.
+        """
         fingers, thumb = list(FINGERTIPS[:-1]), len(FINGERTIPS) - 1
         finger = fingers.index(str(generator.choice(fingers)))
         meeting = self.palm + _MEETING_OFFSET

@@ -47,8 +47,9 @@ class ManipulateConfig:
     """Differences between the manipulation tasks.
 
     Attributes:
-        target_rotation: Rotations of goals. `z`: about the z axis. `parallel`: about the z axis,
-            with any face up. `xyz`: about any axis.
+        asset: MJCF file below the assets folder of Gymnasium-Robotics.
+        target_rotation: Goals are turned about the z axis (`z`), about the z axis with any face up
+            (`parallel`) or about any axis (`xyz`).
         randomizes_rotation: Whether the object starts with a random rotation.
     """
 
@@ -112,8 +113,8 @@ class HandManipulateTask(HandTask):
     def reset(self, ids: Ids, generators: Generators) -> Array:
         """Drop the object on the palm until it stays there; return drawn goals (len(ids), 7).
 
-        Attempts that diverge or let the object fall are repeated with the same controls and warm
-        start, as in Gymnasium-Robotics. After `_MOST_TRIES` attempts, RuntimeError is raised.
+        If an attempt diverges or the object falls, the next one keeps its controls and warm start,
+        as in Gymnasium-Robotics. After 1000 attempts, raise RuntimeError.
         """
         self.batch.state[ids] = self.start_state
         generator_of = dict(zip(ids.tolist(), generators, strict=True))
@@ -130,7 +131,7 @@ class HandManipulateTask(HandTask):
         raise RuntimeError(f'{self.spec.name}: the object fell off the palm {_MOST_TRIES} times')
 
     def _settle(self, ids: Ids) -> NDArray[np.bool_]:
-        """Let objects come to rest; return flags (N,) of diverged simulations."""
+        """Let objects come to rest, for ten ticks; return flags (N,) of diverged simulations."""
         self.take_diverged()
         failed = np.zeros(self.batch.nsim, dtype=np.bool_)
         for advance in (partial(self.batch.step, nstep=self._settling), self.batch.forward):
@@ -147,7 +148,7 @@ class HandManipulateTask(HandTask):
         self.batch.forward(ids)
 
     def _sample_start(self, generator: np.random.Generator) -> Array:
-        """Draw the start pose (7,) of the object."""
+        """Draw the start pose (7,) of the object in the world, position, m, and quaternion, wxyz."""
         position, quaternion = self._object_start[:3].copy(), self._object_start[3:]
         if self.config.randomizes_rotation:
             offset = self._sample_rotation(generator)
@@ -156,7 +157,7 @@ class HandManipulateTask(HandTask):
         return np.concatenate([position, quaternion / np.linalg.norm(quaternion)])
 
     def _sample_rotation(self, generator: np.random.Generator) -> Array:
-        """Draw a rotation as `target_rotation` of the task prescribes, quaternion wxyz (4,)."""
+        """Draw a random rotation of the kind `target_rotation`, a quaternion wxyz (4,)."""
         angle = generator.uniform(-np.pi, np.pi)
         if self.config.target_rotation == 'xyz':
             axis = generator.uniform(-1.0, 1.0, size=3)
@@ -168,9 +169,9 @@ class HandManipulateTask(HandTask):
         return quaternion_multiply(about_z, faces[generator.integers(len(faces))])
 
     def sample_goal(self, index: int, generator: np.random.Generator) -> Array:
-        """Draw a goal pose (7,): the object's present position and a random rotation.
+        """Draw a goal pose (7,) with the object's position in simulation `index`, randomly turned.
 
-        If the position counts (in the `Full` tasks), a random offset is added to it.
+        In the `Full` tasks, in which the position counts, the goal is also randomly shifted.
         """
         position = self._object_qpos[index, :3].copy()
         if self.spec.position_counts:
@@ -179,13 +180,13 @@ class HandManipulateTask(HandTask):
         return np.concatenate([position, quaternion / np.linalg.norm(quaternion)])
 
     def _object_twist(self) -> Array:
-        """Return the linear and angular velocity of the object in world axes, (N, 6)."""
+        """Return the object's linear and angular velocity in world axes, (N, 6), m/s and rad/s."""
         rotation = quaternion_to_matrix(self._object_qpos[:, 3:])
         angular = np.einsum('nij,nj->ni', rotation, self._object_qvel[:, 3:])
         return np.concatenate([self._object_qvel[:, :3], angular], axis=1)
 
     def _object_joint(self) -> Array:
-        """Return qpos and qvel of the object's free joint, (N, 13)."""
+        """Return qpos (7) and qvel (6) of the object's free joint in MuJoCo's order, (N, 13)."""
         return np.concatenate([self._object_qpos, self._object_qvel], axis=1)
 
 

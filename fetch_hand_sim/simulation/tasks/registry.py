@@ -48,7 +48,7 @@ def make_task(name: str, batch: BatchConfig | None = None) -> Task:
 
 
 def _family(spec: TaskSpec) -> Any:
-    """Return the class that simulates a task."""
+    """Return the class that simulates a task of this package or of a third party."""
     return _FAMILIES.get(spec.name) or third_party_simulation(spec.name)
 
 

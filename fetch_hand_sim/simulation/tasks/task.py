@@ -79,7 +79,7 @@ def _stop_timers() -> None:
 
 
 def keep_in_forks(batch: Batch) -> None:
-    """Prevent forked processes from freeing a batch with threads, which they do not have."""
+    """Prevent forked processes from freeing `batch`, because they do not have its threads."""
     if batch.nthread > 1:
         _THREADED.add(batch)
 
@@ -103,7 +103,8 @@ class BatchConfig:
     """Size and settings of a batch of simulations.
 
     `num_threads` 0 uses all processors. With `keeps_data`, each simulation keeps an `MjData`.
-    `timing` is what rates other than 25 Hz keep: an episode's `seconds` or its `ticks`.
+    `timing` names the length of episodes that is kept at other rates than 25 Hz: `seconds` or
+    `ticks`.
     """
 
     num_envs: int = 1
@@ -192,7 +193,7 @@ class Task(ABC):
         """Draw a goal (goal size,) for the present state of simulation `index`."""
 
     def sample_goals(self, ids: Ids, generators: Generators) -> Array:
-        """Draw goals (n, goal size), one simulation after the other."""
+        """Draw goals (n, goal size) of `ids` in turn, or return zeros if `draws_goals` is False."""
         if not self.draws_goals:
             return np.zeros((ids.size, self.spec.goal.size))
         pairs = zip(ids.tolist(), generators, strict=True)
@@ -204,7 +205,7 @@ class Task(ABC):
 
     @abstractmethod
     def apply_commands(self, commands: NDArray[np.floating]) -> None:
-        """Set actuators or mocap targets from commands (N, action size) in the robot's limits."""
+        """Set actuators or mocap targets from commands (N, action size), clipped by the caller."""
 
     @abstractmethod
     def resting_commands(self) -> Array:
@@ -230,7 +231,7 @@ class Task(ABC):
         self.batch.step(nstep=self.substeps)
 
     def follow_model(self) -> None:
-        """Apply changes of `model`: physics, time step and `<pair>` elements of changed geoms."""
+        """Apply changes of `model` to the batch and `tick_duration`; update `<pair>` elements."""
         self.pairs.follow(self.model)
         self.batch.set_models(self.model)
         self.tick_duration = self.substeps * float(self.model.opt.timestep)
@@ -293,7 +294,7 @@ class Task(ABC):
             self._write_output(name, slice(None), state[name])
 
     def new_data(self, state: Array) -> mujoco.MjData:
-        """Return a new `MjData` in a state (state size,), without derived values."""
+        """Return a new `MjData` in a state (state size,); `mj_forward` adds the derived values."""
         data = mujoco.MjData(self.model)
         mujoco.mj_setState(self.model, data, state, mujoco.mjtState.mjSTATE_INTEGRATION.value)
         return data
@@ -331,7 +332,7 @@ class Task(ABC):
         return self.observe_from(self.readings(self.spec.observed_topics))
 
     def observe_from(self, readings: Readings) -> tuple[Array, Array]:
-        """Return the observations and achieved goals computed from sensor readings."""
+        """Return observations and achieved goals of sensor readings, with the same leading axes."""
         goal = achieved_goal(self.spec, readings)
         return observation(self.spec, readings, self.tick_duration), goal
 
@@ -369,7 +370,7 @@ def integration_state(model: mujoco.MjModel, data: mujoco.MjData) -> Array:
 
 
 class SiteMotion:
-    """Maps joint velocities to the velocity of a site; Jacobian of the last forward pass."""
+    """Computes the velocity of a site from joint velocities and the last computed Jacobian."""
 
     def __init__(self, task: Task, site: int) -> None:
         model, body = task.model, int(task.model.site_bodyid[site])

@@ -1,4 +1,4 @@
-"""Pull a body with the mouse, by a spring between both (a perturbation of MuJoCo)."""
+"""Pull a body by a spring between mouse and body, which MuJoCo calls a perturbation."""
 
 from __future__ import annotations
 
@@ -31,9 +31,10 @@ def can_be_pulled(model: mujoco.MjModel, body: int) -> bool:
 
 
 def pulls(model: mujoco.MjModel, snapshot: messages.PerturbSnapshot) -> list[tuple[str, Array]]:
-    """Return name and wrench (6,), N and N m, of each pulled body in a snapshot of forces.
+    """Return the name of each body that a snapshot pulls and its wrench (6,), N and N m.
 
-    Wrenches act at the centre of mass, along the world axes. A snapshot of another model gives [].
+    Wrenches act at the centre of mass, along the world axes. A snapshot whose size does not fit
+    `model` gives [].
     """
     size = mujoco.mj_stateSize(model, _FORCES)
     if snapshot.state_sig != _FORCES or snapshot.state.shape != (size,):
@@ -61,7 +62,7 @@ class BodyDrag:
     def begin(self, ray: Ray, limit: float) -> bool:
         """Grab the body under the mouse; return False if no body there can be pulled.
 
-        The force is at most `limit`, N.
+        The force reaches `limit`, N, at a spring length of 0.1 times the distance of the camera.
         """
         viewer, perturb = self._viewer, self._viewer.perturb
         model, data = viewer.model, viewer.data
@@ -78,9 +79,10 @@ class BodyDrag:
         return True
 
     def move(self, delta: Sequence[float]) -> messages.PerturbSnapshot:
-        """Move the spring's end with the mouse; return the forces on all bodies as a message.
+        """Move the spring's end with the mouse; return the wrenches on all bodies as a message.
 
-        `delta` (2,) is the movement since the last call, in widths and heights of the picture.
+        `delta` (2,) is the movement of the mouse since the last call, to the right in widths and
+        down in heights of the picture.
         """
         viewer, data = self._viewer, self._viewer.data
         if any(delta):
@@ -100,7 +102,7 @@ class BodyDrag:
 def _body_under(
     model: mujoco.MjModel, data: mujoco.MjData, options: mujoco.MjvOption, ray: Ray
 ) -> tuple[int, Array]:
-    """Return id (-1 if none) of the first body on a ray, except the ghost, and the point (3,)."""
+    """Return the first body that a ray hits (-1 if none; not the ghost), and the point (3,), m."""
     ghost = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY.value, GHOST)
     geom = np.full((1, 1), -1, dtype=np.int32)
     distance = mujoco.mj_ray(

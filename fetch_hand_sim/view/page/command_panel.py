@@ -19,7 +19,7 @@ _MOVES = 'x '
 
 
 def is_move(part: CommandPart) -> bool:
-    """Return whether a command is a distance to move in each tick, not a target position."""
+    """Return whether a part of the command is a motion per tick, as x, y and z of Fetch are."""
     return part.unit.startswith(_MOVES)
 
 
@@ -27,7 +27,8 @@ class Teleoperation:
     """Holds the command that the user changes with the sliders and arrow keys of the page.
 
     Args:
-        start: (action size,) the last command of the robot; None for the resting command.
+        start: (action size,) the last command of the robot; None for the resting command. Motions
+            per tick (see `is_move`) begin at 0.
 
     Attributes:
         values: (action size,) the command, command units.
@@ -50,8 +51,8 @@ class Teleoperation:
     def hold(self, direction: int, seconds: float) -> None:
         """Change the selected value by an arrow key; call it in every frame, also without a key.
 
-        A held key moves a target position through its range in 2 s. It sets a distance per tick
-        (see `is_move`) to its limit; a released key sets it to 0.
+        A held key moves a target position through its range in 2 s. It sets a motion per tick (see
+        `is_move`) to its upper or lower limit; a released key sets it to 0.
 
         Args:
             direction: -1 or 1 while a key is held, 0 without a key.
@@ -81,7 +82,7 @@ class CommandPanel:
         self._teleoperation: Teleoperation | None = None
 
     def draw(self, spec: TaskSpec, picture: Picture) -> None:
-        """Draw the panel; while its switch is on, send the sliders' command in every frame."""
+        """Draw the panel; while its checkbox is on, send the sliders' command in every frame."""
         facts = picture.facts
         if self._task != spec.name or not facts.is_commanding:
             self._task, self._teleoperation = spec.name, None

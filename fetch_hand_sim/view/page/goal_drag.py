@@ -22,7 +22,7 @@ _ON_THE_TABLE = ('FetchPush', 'FetchSlide')
 
 @dataclass(frozen=True, slots=True)
 class Handle:
-    """A point of a goal that the mouse can grab: its number and its drawn position (3,), m."""
+    """The `index`-th point of a goal, which the mouse can grab, and its drawn position (3,), m."""
 
     index: int
     position: Array
@@ -36,7 +36,7 @@ def handles(spec: TaskSpec, goal: Array) -> list[Handle]:
 
 
 def find_handle(spec: TaskSpec, goal: Array, ray: Ray) -> Handle | None:
-    """Return the handle nearest to the mouse, or None if it is too far away to grab."""
+    """Return the handle nearest to the ray under the mouse; None if it is beyond `_REACH`, m."""
     nearest = min(handles(spec, goal), key=lambda each: ray.distance_to(each.position))
     return nearest if ray.distance_to(nearest.position) < _REACH[spec.goal] else None
 
@@ -46,11 +46,13 @@ def moved_goal(
 ) -> Array:
     """Return the goal (goal size,) after the mouse has moved.
 
+    Goals move parallel to the picture, or along the table for FetchPush and FetchSlide.
+
     Args:
-        goal: (goal size,) the goal when the mouse grabbed it.
+        goal: (goal size,) the goal when the mouse grabbed `handle`.
         ray: The present ray under the mouse.
         is_turning: Whether to turn a pose, not move it; a pose without position always turns.
-        delta: (2,) movement of the mouse since the grab, in widths and heights of the picture.
+        delta: (2,) mouse movement since the grab, in picture widths and heights; 1 is a full turn.
     """
     if spec.goal is GoalKind.POSE and (is_turning or not spec.position_counts):
         return _turned(spec, goal, ray, delta)

@@ -22,7 +22,7 @@ _FINGERS = ('first finger', 'middle finger', 'ring finger', 'little finger', 'th
 
 
 def position_ranges(spec: TaskSpec) -> tuple[tuple[float, float], ...]:
-    """Return (lower, upper) of the sliders for x, y and z, metres: about the range of the goals."""
+    """Return limits (lower, upper) of the sliders for x, y and z, m, close to those of goals."""
     if spec.goal is GoalKind.FINGERTIPS:
         return _FINGERTIP_RANGES
     if not spec.robot.has_gripper_command:
@@ -69,7 +69,7 @@ def _draw_position(spec: TaskSpec, position: Array) -> None:
 
 
 def _draw_angles(spec: TaskSpec, quaternion: Array) -> Array:
-    """Draw sliders for the Euler angles; return the new quaternion, or `quaternion` if unmoved."""
+    """Draw sliders for Euler angles; return the new quaternion, wxyz, or the old one if unmoved."""
     angles = quaternion_to_euler(quaternion)
     axes = (2,) if spec.looks_like == 'HandManipulateBlockRotateZ' else (0, 1, 2)
     has_changed = False

@@ -1,4 +1,4 @@
-"""The viewer plugin that draws the page and handles the mouse."""
+"""The plugin of `mujoco.studio` that draws the page and handles the mouse."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class _GoalDrag:
 
 
 class Page(plugin.ViewerPlugin):
-    """Draws the scene and the panels, and sends the user's requests.
+    """Draws the scene and the panels, and sends the user's requests by `viewer.send_to_sim`.
 
     Args:
         episodes: Episode files to choose from.
@@ -56,12 +56,12 @@ class Page(plugin.ViewerPlugin):
 
     @messages.handler
     def on_scene(self, event: ShowScene) -> None:
-        """Store the scene of another task; its model is loaded before the next `PostModelEvent`."""
+        """Store the scene of another task; `PostModelEvent` follows when its model is loaded."""
         self._scene, self._picture, self._goal_drag = event.scene, None, None
 
     @messages.handler
     def on_post_model(self, event: messages.PostModelEvent) -> None:
-        """Point the camera at the scene of the new model."""
+        """End a pull at a body and point the camera at the scene of the new model."""
         del event
         if self._body_drag is not None:
             self._body_drag.end()
@@ -80,7 +80,7 @@ class Page(plugin.ViewerPlugin):
 
     @messages.handler
     def on_update(self, event: messages.UpdateEvent) -> None:
-        """Handle the mouse and draw the markers."""
+        """Handle the mouse and draw the markers of the newest picture, such as goal and trail."""
         del event
         self._follow_mouse()
         picture = self._picture

@@ -99,12 +99,12 @@ class Panels:
 
 
 def _height(is_shown: bool) -> float:
-    """Return the height, pixels, of the current window if it `is_shown`, else of its button."""
+    """Return the height, pixels, of the current window, or of its button if it is folded."""
     return float(imgui.GetWindowSize().y) if is_shown else _BUTTON_HEIGHT
 
 
 class EpisodeList:
-    """A list of episodes to choose from; only files of visible rows are read."""
+    """A list of episode files; a click plays one. Only the files of visible rows are read."""
 
     def __init__(self, paths: tuple[Path, ...], send: Send) -> None:
         self._paths = paths
@@ -116,7 +116,7 @@ class EpisodeList:
         return len(self._paths)
 
     def draw(self, number: int) -> None:
-        """Draw the visible part of the list; episode `number` is being played."""
+        """Draw the visible rows; highlight and scroll to the played one, which is `number`."""
         if number != self._played and number != self._clicked:
             # Scroll to an episode that was chosen elsewhere on the page.
             height = imgui.GetTextLineHeightWithSpacing()
@@ -133,7 +133,7 @@ class EpisodeList:
 
 
 def describe(path: Path) -> str:
-    """Return name and outcome of an episode as a line of the list; this takes about 1 ms."""
+    """Return name and outcome (`reached`, `missed`, `interrupted`, `unreadable`) of an episode."""
     name = path.name.removesuffix('.mcap')
     try:
         outcome = read_summary(path).outcome
@@ -145,7 +145,7 @@ def describe(path: Path) -> str:
 
 
 def draw_timeline(timeline: Timeline, facts: Facts, send: Send) -> None:
-    """Draw the playback controls of an episode file: buttons, a choice of speed, and a slider."""
+    """Draw the playback controls of a file, disabled if the page may only watch."""
     imgui.BeginDisabled(not facts.may_command)
     if imgui.Button('<< Episode'):
         send(ChangeEpisode(-1))

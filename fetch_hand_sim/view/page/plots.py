@@ -20,7 +20,7 @@ _ROOM = 0.15
 
 
 def draw_plots(spec: TaskSpec, graphs: Graphs, width: float) -> None:
-    """Draw one plot each for distance, rotation and reward, and for each command and its joint."""
+    """Draw a plot for each curve of `graphs`; a command and its joint share a plot."""
     if graphs.distance is not None:
         curves = {'distance (m)': graphs.distance}
         _plot('##Distance', curves, width, threshold=spec.distance_threshold)
@@ -39,7 +39,7 @@ def draw_plots(spec: TaskSpec, graphs: Graphs, width: float) -> None:
 
 
 def command_curves(part: CommandPart, graphs: Graphs, index: int) -> dict[str, Series]:
-    """Return the curves of one command and of the joint that it drives, by label."""
+    """Return the curves of the command `index` and of its joint, if it drives one, by label."""
     assert graphs.commands is not None
     command = _column(graphs.commands, index)
     if is_move(part):
@@ -55,7 +55,7 @@ def command_curves(part: CommandPart, graphs: Graphs, index: int) -> dict[str, S
 def value_limits(
     curves: Iterable[Series], threshold: float | None, begin: float, end: float
 ) -> tuple[float, float]:
-    """Return the y limits that show the threshold and all curves from time `begin` to `end`, s."""
+    """Return (lower, upper) y limits for the threshold and the curves from `begin` to `end`, s."""
     parts = [each.values[(each.times >= begin) & (each.times <= end)] for each in curves]
     values = np.concatenate([*parts, [] if threshold is None else [threshold]])
     values = values[np.isfinite(values)]

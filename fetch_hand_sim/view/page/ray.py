@@ -1,4 +1,4 @@
-"""Rays from a free camera through the mouse into the world."""
+"""Compute rays from a free camera through the mouse position into the world."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Ray:
     up: Array
 
     def distance_to(self, point: Array) -> float:
-        """Return the distance of a point (3,) from the ray, m; infinity behind the camera."""
+        """Return the distance of a point (3,) from the ray, m; infinity behind its start."""
         offset = point - self.origin
         along = float(offset @ self.direction)
         if along <= 0.0:
@@ -53,7 +53,7 @@ class Ray:
         return float(np.linalg.norm(offset - along * self.direction))
 
     def meets_plane(self, point: Array, normal: Array) -> Array | None:
-        """Return the intersection (3,) with the plane through `point`; None without one."""
+        """Return the intersection (3,) with the plane through `point`; None if they do not meet."""
         slope = float(self.direction @ normal)
         if abs(slope) < 1e-6:
             return None
@@ -62,7 +62,7 @@ class Ray:
 
 
 def mouse_ray(camera: View | mujoco.MjvCamera, fovy: float, mouse: MousePlace) -> Ray:
-    """Return the ray under the mouse; `fovy` is the camera's vertical field of view, degrees."""
+    """Return the ray through the mouse; `fovy` is the vertical field of view, degrees."""
     a, e = np.radians(camera.azimuth), np.radians(camera.elevation)
     forward = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
     right = np.array([np.sin(a), -np.cos(a), 0.0])

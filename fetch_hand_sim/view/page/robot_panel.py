@@ -37,7 +37,7 @@ _INTRODUCTIONS = {
 
 
 def introduction(spec: TaskSpec) -> str:
-    """Return a sentence that describes the task to the user."""
+    """Return the sentences that describe the task to the user."""
     text = _INTRODUCTIONS.get(spec.name)
     things = (word for word in ('Block', 'Egg', 'Pen') if f'HandManipulate{word}' in spec.name)
     if spec.formulas is None and (thing := next(things, '').lower()):
@@ -109,7 +109,7 @@ class RobotPanel:
 
 
 def draw_actors(facts: Facts, send: Send) -> None:
-    """Draw a combo box of actors; pass a choice to `send`. An unlisted active actor comes first."""
+    """Draw a combo box of actors, also of an unlisted active one; pass a choice to `send`."""
     names, index = list(facts.actors), 0
     if facts.actor in names:
         index = names.index(facts.actor)

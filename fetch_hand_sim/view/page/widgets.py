@@ -29,7 +29,7 @@ class Windows:
         self._has_folded = False
 
     def fold_once(self, *names: str) -> None:
-        """Hide the named windows at the first call; later calls do nothing, whatever the names."""
+        """Hide the windows with these titles at the first call; later calls do nothing."""
         if not self._has_folded:
             self._has_folded = True
             self._hidden.update(names)
@@ -38,7 +38,7 @@ class Windows:
     def column(self, title: str, x: float, y: float, height: float = 0.0) -> Iterator[bool]:
         """Draw a window of width `WIDTH`; yield whether to draw its content.
 
-        If the user has hidden the window, draw a button that shows it again.
+        If the user has hidden the window, yield False and draw a button that shows it again.
 
         Args:
             title: Title, which may change; text after `###` identifies the window.
@@ -65,7 +65,10 @@ class Windows:
 
 @contextmanager
 def untitled_window(name: str, x: float, y: float, width: float, height: float) -> Iterator[bool]:
-    """Draw a window without title that cannot be hidden; yield whether to draw its content."""
+    """Draw a window without title that cannot be hidden; yield whether to draw its content.
+
+    `name` identifies the window. Positions and sizes are pixels; a size of 0 fits the content.
+    """
     _place(x, y, width, height)
     flags = _flags() | int(imgui.WindowFlags.NoTitleBar) | int(imgui.WindowFlags.NoScrollbar)
     try:
@@ -81,19 +84,19 @@ def say(text: str) -> None:
 
 
 def draw_pause(is_paused: bool, resume: str, send: Send) -> None:
-    """Draw a button that pauses; while paused, it has the label `resume` and resumes."""
+    """Draw a button that sends `SetPaused`; its label is `Pause`, or `resume` while paused."""
     if imgui.Button(resume if is_paused else 'Pause'):
         send(SetPaused(not is_paused))
 
 
 def draw_step(label: str, frames: int, send: Send) -> None:
-    """Draw a button that steps a robot, or moves the playhead of a file by `frames`."""
+    """Draw a button that runs one tick of a robot, or moves the playhead of a file by `frames`."""
     if imgui.Button(label):
         send(StepOnce(frames))
 
 
 def draw_speed(speed: float, send: Send) -> None:
-    """Draw a choice of speeds, which includes the current one."""
+    """Draw a menu of speeds, simulated seconds per second; 0 is as fast as possible."""
     speeds = sorted({*_SPEEDS, speed})
     imgui.SetNextItemWidth(90.0)
     names = ['fastest' if each == _AS_FAST_AS_POSSIBLE else f'x {each:g}' for each in speeds]

@@ -344,11 +344,7 @@ class TrainConfig(
     """
 
     def __post_init__(self) -> None:
-        """Check each field, then the rules between fields.
-
-        Raises:
-            ValueError: If a value is not allowed, or fields exclude each other.
-        """
+        """Check each field, then the rules between fields; store `disturbances` as JSON text."""
         for name, each in FIELDS.items():
             each.require(getattr(self, name))
         # A file may change, or be missing where the run is resumed.
@@ -360,7 +356,10 @@ class TrainConfig(
 
     @property
     def tick_share(self) -> float:
-        """Exponent of `gamma` and factor on rewards: 1, or tick / 40 ms with `discount=time`."""
+        """Length of a tick / 40 ms with `discount=time`, else 1.
+
+        `gamma` is raised to this power, and rewards are multiplied by it.
+        """
         return DEFAULT_CONTROL_HZ / self.control_hz if self.discount == 'time' else 1.0
 
     @property
@@ -391,7 +390,7 @@ class Field:
     Attributes:
         group: Title of its group of fields in `--help`.
         meaning: Description of the field, on one line.
-        kind: Type of the field, without its range.
+        kind: Type of the field without its range, such as `int`; `str` for a set of names.
         choices: Allowed values if the field has a fixed set of them, else an empty tuple.
         limits: Allowed range if the field is a number with limits, else None.
         default: Default of the field; None for `task`, which has no default.
@@ -437,7 +436,7 @@ def _describe() -> Iterator[Field]:
 
 
 def _parts(hint: Any) -> tuple[Any, tuple[str, ...], Range | None]:
-    """Return the plain type, the choices and the range that a type annotation contains."""
+    """Return type, choices (or an empty tuple) and range (or None) of a type annotation."""
     if typing.get_origin(hint) is Literal:
         return str, typing.get_args(hint), None
     is_ranged = typing.get_origin(hint) is Annotated
@@ -556,7 +555,7 @@ def _rules(config: TrainConfig, spec: TaskSpec) -> Iterator[tuple[bool, str]]:
     """Yield each rule between fields as a pair: whether it is broken, and the error message.
 
     Raises:
-        ValueError: If `goal_features` is invalid.
+        ValueError: If `goal_features` is unknown, or invalid for this task.
     """
     c = config
     goal_features(c.goal_features, spec)
@@ -678,9 +677,8 @@ def idle_parts(config: TrainConfig, critic_first: int = 0) -> Iterator[str]:
     Examples: the run ends before its first update, or exploration noise replaces all actions.
 
     Args:
-        config: Configuration of the whole run.
-        critic_first: Number of first updates in which only the critic learns; ignored if
-            `config.critic_first` is larger.
+        critic_first: Number of first updates in which only the critic of the learner is trained;
+            the larger one of this number and `config.critic_first` counts.
     """
     c = config
     spec = task_spec(c.task, control_hz=c.control_hz)

@@ -223,10 +223,7 @@ def add_field_options(parser: argparse.ArgumentParser, without: tuple[str, ...])
     """Add an option for each field to `parser`, for example `--learning-rate` for `learning_rate`.
 
     Options that the user does not give are None. `--help` shows the options by group, except those
-    for studies, which `--help-research` shows.
-
-    Args:
-        without: Names of fields that get no option.
+    for studies, which `--help-research` shows. Fields named in `without` get no option.
     """
     research = argparse.ArgumentParser(
         prog=parser.prog, usage='fields for studies (docs/research)', add_help=False
@@ -288,7 +285,6 @@ def with_assignments(
     """Return the values given by options and by `--set`, by field.
 
     Args:
-        given: Fields given by options.
         assignments: Texts `name=value` of `--set`; the last one for a field counts.
         options: Option names by field, for error messages; by default the field's name with dashes.
 

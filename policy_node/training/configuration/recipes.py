@@ -29,7 +29,7 @@ def ticks_of_40_ms(control_hz: float) -> float:
 
 
 def steps_at_rate(values: Mapping[str, Any], control_hz: float) -> dict[str, Any]:
-    """Return the fields in `values` that count 40 ms steps, converted to ticks at `control_hz`."""
+    """Return the fields `STEP_COUNTS` in `values`, converted from steps of 40 ms to ticks."""
     ticks = ticks_of_40_ms(control_hz)
     return {name: round(values[name] * ticks) for name in STEP_COUNTS if name in values}
 
@@ -212,9 +212,9 @@ _EXACT = {'FetchSlide': (0.0, (1.0, 0.5)), 'FetchPickAndPlace': (1.0, (1.0, 1.0,
 def _robust(task: str) -> dict[str, Any]:
     """Return the fields of the recipe `robust`, which imitates the shipped policy.
 
-    The robot has an action latency of 0 to 2 ticks and the preset `hardware`: at half strength,
-    for FetchPickAndPlace at full strength, for FetchSlide not at all. For these two tasks, the
-    loss also penalizes actions of lower value than the shipped policy's (docs/robust_policies.md).
+    The robot has an action latency of 0 to 2 ticks and the preset `hardware` at half strength.
+    FetchPickAndPlace has it at full strength; FetchSlide has only the latency. The loss of both
+    also penalizes actions of lower value than the shipped policy's (docs/robust_policies.md).
     """
     scale, in_turn = _EXACT.get(task, (0.5, (1.0,)))
     scaled = PRESETS['hardware'].scaled(scale)
@@ -263,9 +263,9 @@ def _object_in_hand(task: str) -> dict[str, Any]:
 def _finetune(task: str) -> dict[str, Any]:
     """Return the fields of the recipe `finetune`, which trains a shipped policy further.
 
-    For block, pen and full egg, three settings keep the critic from overestimating values: no
-    goals from the future of the transition, a short horizon and rare updates of the actor
-    (docs/lab_notes/training_log.md).
+    For block and pen tasks and HandManipulateEggFull, three settings keep the critic from
+    overestimating values: no goals from the future of the transition, a short horizon and rare
+    updates of the actor (docs/lab_notes/training_log.md).
 
     Raises:
         ValueError: If the task is neither FetchSlide nor has an object in the hand.
@@ -301,7 +301,7 @@ def _finetune(task: str) -> dict[str, Any]:
 
 
 def _shipped_networks(task: str) -> dict[str, Any]:
-    """Return the fields that make networks with the sizes and inputs of a task's shipped actor."""
+    """Return the fields that give networks the sizes and inputs of a task's shipped actor."""
     best = _best(task)
     kept = ('layer_norm', 'goal_features')
     networks: dict[str, Any] = {name: best[name] for name in kept if name in best}

@@ -49,7 +49,7 @@ class ActionNoise:
     def around(self, action: NDArray[Any], tick: int) -> Array32:
         """Return `action` (simulations, action size) with exploration noise, clipped to [-1, 1].
 
-        `tick` counts the steps of the episode from 0; tick 0 draws new noise.
+        `tick` counts the steps of the episode from 0. Multiples of `ticks` draw new noise.
         """
         share = self.share
         if tick % self._ticks == 0:
@@ -69,9 +69,9 @@ class Collector:
 
     Args:
         seeds: One seed per simulation for its resets; the first also seeds exploration.
-        extra_actions: Additional outputs of the policy. They are recorded, with noise, but not sent
-            to the simulation.
-        extra_columns: Additional values recorded with each action, which a subclass fills in.
+        extra_actions: Number of additional outputs of the policy. They are recorded, with noise,
+            but not sent to the simulation.
+        extra_columns: Number of values that a subclass computes and records after each action.
 
     Attributes:
         exploration: Factor on all exploration noise, 0 ... 1.
@@ -139,27 +139,27 @@ class Collector:
         return episodes.select(whole), float(success[whole].mean()) if whole.any() else 0.0
 
     def _begin(self, policy: Policy) -> Policy:
-        """Set the noise before new episodes; return the policy that acts in them.
+        """Scale the noise by `exploration`; return the policy that acts in the next episodes.
 
-        Here this is `policy` itself. Subclasses may return another one, for example a perturbed
-        copy.
+        Here it is `policy` itself. Subclasses may return another one, such as a perturbed copy.
         """
         self._noise.share = self.exploration
         return policy
 
     def _end(self, policy: Policy, acting: Policy, episodes: Episodes) -> None:
-        """Hook after the episodes, which does nothing here; a subclass may adapt its noise.
+        """Do nothing after the episodes; a subclass may adapt its exploration noise here.
 
         `policy` is the policy without noise; `acting` is the result of `_begin`, which acted.
+        `episodes` includes those that diverged.
         """
 
     def _explore(
         self, policy: Policy, observation: Observations, past: Array32, tick: int
     ) -> Array32:
-        """Return the actions of one tick to record, with noise, (simulations, recorded columns).
+        """Return the values to record in one tick, (simulations, recorded columns).
 
-        The first columns are the robot's actions. `past` contains the past actions, (simulations,
-        `past_actions` * action size).
+        These are the robot's actions with noise, then the extra actions and extra columns. `past`
+        contains the robot's past actions, (simulations, `past_actions` * action size).
         """
         return self._noise.around(self._predict(policy, observation, past), tick)
 

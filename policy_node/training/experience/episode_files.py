@@ -19,7 +19,7 @@ from policy_node.training.experience.replay import EpisodeReplay, Episodes
 def save_replay(path: Path, replay: EpisodeReplay, transitions: int) -> None:
     """Write the newest episodes of a replay to a file, at least `transitions` transitions.
 
-    A replay with fewer transitions is written completely.
+    Only whole episodes are written. A replay with fewer transitions is written completely.
 
     Raises:
         OSError: If the file cannot be written; no partial file is left.
@@ -44,12 +44,7 @@ def load_replay(path: Path, replay: EpisodeReplay) -> None:
 
 
 def _require_whole(episodes: Episodes) -> None:
-    """Check that episodes from a file are undamaged.
-
-    Raises:
-        ValueError: If an array is not float32 or not finite, or the arrays have different numbers
-            of episodes.
-    """
+    """Raise ValueError unless the arrays are finite float32 and have equally many episodes."""
     for name in Episodes.__slots__:
         array = getattr(episodes, name)
         if array.dtype != np.float32:
@@ -67,8 +62,7 @@ def read_experience(
 
     Args:
         directory: Episodes of `sim_node` or `fetch_hand_sim episodes generate`.
-        task: The task; episodes of other tasks are skipped.
-        control_hz: Action frequency, Hz; episodes at other frequencies are skipped.
+        control_hz: Action frequency, Hz.
 
     Returns:
         The usable episodes, and one line for each skipped episode. An episode is skipped if it is

@@ -44,7 +44,7 @@ class RunningStatistics(nn.Module):
     def update(self, values: ArrayLike, workers: Workers) -> None:
         """Add the rows of `values` (..., size) of all workers to the sums.
 
-        Values are clipped first, as network inputs are. All workers must call this together.
+        Values are clipped to -200 ... 200, as network inputs are. All workers call this together.
         """
         array = np.asarray(values, dtype=np.float64)
         rows = np.clip(array.reshape(-1, array.shape[-1]), -INPUT_CLIP, INPUT_CLIP)
@@ -72,9 +72,9 @@ class Experience:
 
     Args:
         config: The configuration; `replay_transitions` and `batch_size` are totals of all workers.
-        extra_columns: Number of values recorded with each action beside the robot's action.
+        extra_columns: Number of values stored with each action in addition, such as a subgoal.
         weigh: Function that returns the weight of each episode. The share `moved_share` of a batch
-            is drawn by these weights.
+            is drawn by these weights, the rest without them.
     """
 
     def __init__(
@@ -136,7 +136,7 @@ class Experience:
             self.statistics[name].write(normalizer)
 
     def narrow(self, progress: float) -> None:
-        """Set the reward thresholds to those at `progress`, the finished share of the run."""
+        """Set the reward thresholds for `progress`, the finished share 0 ... 1 of the run."""
         self._sampler = self._sampler.at(progress)
 
     def batch(self, env_steps: int) -> Transitions:
@@ -150,7 +150,7 @@ class Experience:
     def _draw(
         self, mixture: dict[str, float], sampler: TransitionSampler | None = None
     ) -> Transitions:
-        """Draw a batch by `sampler` or the usual one; `mixture` maps goal sources to shares."""
+        """Draw a batch with goals from `mixture`, by `sampler` or by the sampler of this object."""
         chosen, replay = sampler or self._sampler, self.replay
         row = self._draw_rows()
         return chosen.sample(replay.episodes, row, mixture, self.generator, replay.valid_ticks)

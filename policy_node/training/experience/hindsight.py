@@ -32,11 +32,11 @@ def goal_mixture(strategy: str, k: int = 4, goals: Mapping[str, float] = {}) -> 
 
     Args:
         strategy: `final`, `future`, `episode` and `random` relabel k goals for each goal kept.
-            `futureactual` draws k/2 future goals and k/2 desired goals of other episodes for each
+            `futureactual` draws k/2 future goals and k/2 desired goals of random episodes for each
             goal kept. `none` keeps all goals.
         k: Number of relabelled goals for each goal kept.
-        goals: Probability of each source, instead of `strategy` and `k`. If they add up to less
-            than 1, the rest is `real`: transitions keep the goal of their episode.
+        goals: Probability of each source; replaces `strategy` and `k` unless empty. If they add
+            up to less than 1, the rest goes to `real`, which keeps the goal of the episode.
     """
     share = k / (k + 1)
     if goals:
@@ -85,29 +85,29 @@ def goals_of(
 
 
 def _future(starts: Starts, generator: np.random.Generator) -> Array32:
-    """Return goals achieved in the same episode, at the end of the transition or later."""
+    """Return goals achieved at a random state from the end of the transition to `starts.last`."""
     return _achieved(starts, generator.integers(starts.tick + 1, starts.last + 1))
 
 
 def _final(starts: Starts, generator: np.random.Generator) -> Array32:
-    """Return the goals achieved last in the same episode, except after the object was dropped."""
+    """Return the goals achieved at `starts.last`, the last valid state of each episode."""
     del generator
     return _achieved(starts, starts.last)
 
 
 def _episode(starts: Starts, generator: np.random.Generator) -> Array32:
-    """Return goals achieved in the same episode, but not at its start or after a dropped object."""
+    """Return goals achieved at a random state of the same episode, from tick 1 to `starts.last`."""
     return _achieved(starts, generator.integers(1, starts.last + 1))
 
 
 def _random(starts: Starts, generator: np.random.Generator) -> Array32:
-    """Return goals achieved in any episode, but not at its start or after a dropped object."""
+    """Return goals achieved in random episodes, at a tick from 1 to the last valid state."""
     row = generator.integers(len(starts.episodes), size=len(starts.row))
     return _episode(replace(starts, row=row), generator)
 
 
 def _actual(starts: Starts, generator: np.random.Generator) -> Array32:
-    """Return the desired goals of random episodes."""
+    """Return the desired goals of random episodes, one for each transition."""
     row = generator.integers(len(starts.episodes), size=len(starts.row))
     return starts.episodes.desired_goal.take(row, axis=0)
 
@@ -153,7 +153,7 @@ def displace(here: Array32, before: Array32, after: Array32) -> Array32:
 
 
 def _achieved(starts: Starts, state: NDArray[np.int64]) -> Array32:
-    """Return the goal achieved at tick `state` of each transition's episode, (batch, goal_size)."""
+    """Return the goals achieved at ticks `state`, (batch,), of each transition's own episode."""
     achieved = flat(starts.episodes.achieved_goal)
     return achieved.take(starts.row * (starts.episodes.ticks + 1) + state, axis=0)
 

@@ -1,4 +1,4 @@
-"""Replay of whole episodes, which hindsight needs, and batches of transitions."""
+"""Store whole episodes, as hindsight needs them, and define batches of transitions."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Episodes:
         return self.select(slice(-count, None))
 
     def select(self, rows: NDArray[np.bool_ | np.int64] | slice) -> Episodes:
-        """Return the episodes that an index array, a mask or a slice (no copies) selects."""
+        """Return the selected episodes: copies for indices or a mask, views for a slice."""
         return Episodes(*(getattr(self, name)[rows] for name in Episodes.__slots__))
 
 
@@ -60,9 +60,9 @@ class EpisodeReplay:
     Args:
         capacity: Largest number of episodes.
         ticks: Steps per episode.
-        weigh: Function that returns the weight of each episode for `draw`; None is `has_moved`.
-        count_ticks: Function that returns for each episode how many of its first ticks are valid:
-            only these are learned from. None makes all ticks valid.
+        weigh: Function that returns the weight of each episode for `draw`; None means `has_moved`.
+        count_ticks: Function that returns how many steps at the start of each episode are valid,
+            (episodes,). Learning uses only valid steps. None makes all valid.
 
     Attributes:
         last_added: Number of episodes that the last call of `add` stored.
@@ -148,13 +148,13 @@ class EpisodeReplay:
 
     @property
     def valid_ticks(self) -> NDArray[np.int64] | None:
-        """Number of first ticks to learn from in each stored episode; None if all ticks count."""
+        """Number of valid steps at the start of each stored episode; None if all are valid."""
         return None if self._count_ticks is None else self._valid[: self._size]
 
     def draw(
         self, count: int, weighted_share: float, generator: np.random.Generator
     ) -> NDArray[np.int64]:
-        """Draw episodes with replacement, in proportion to their number of ticks to learn from.
+        """Draw episodes with replacement, in proportion to their number of valid steps.
 
         Args:
             count: Number of episodes to draw.
@@ -175,10 +175,7 @@ class EpisodeReplay:
 
 
 def draw_by(sums: Array, count: int, generator: np.random.Generator) -> NDArray[np.int64]:
-    """Draw `count` row numbers with the probabilities whose cumulative sums are `sums`.
-
-    The last sum may differ from 1.
-    """
+    """Draw `count` row numbers, with replacement, by weights with the cumulative sums `sums`."""
     # A draw may round up to the last sum: it means the last row with a weight above 0.
     last = np.searchsorted(sums, sums[-1])
     row = np.searchsorted(sums, sums[-1] * generator.random(count), 'right')
@@ -186,7 +183,7 @@ def draw_by(sums: Array, count: int, generator: np.random.Generator) -> NDArray[
 
 
 def has_moved(episodes: Episodes) -> NDArray[np.float64]:
-    """Return (episodes,): 1 if the achieved goal ever left its start by `MOVED_DISTANCE`, or 0."""
+    """Return (episodes,): 1 if the achieved goal left its start by > `MOVED_DISTANCE`, else 0."""
     offset = episodes.achieved_goal - episodes.achieved_goal[:, :1]
     moved = np.square(offset).sum(axis=-1).max(axis=-1) > MOVED_DISTANCE**2
     return np.asarray(moved, dtype=np.float64)
@@ -200,8 +197,8 @@ class Starts:
         episodes: The episodes from which the transitions are drawn.
         row: Row number of the episode of each transition, (batch,).
         tick: Tick of the first state of each transition, (batch,).
-        valid_ticks: Number of first ticks of each episode to learn from, (episodes,); None if all
-            ticks count.
+        valid_ticks: Number of steps at the start of each episode that are used for learning,
+            (episodes,); None if all are.
     """
 
     episodes: Episodes
@@ -211,19 +208,19 @@ class Starts:
 
     @property
     def last(self) -> NDArray[np.int64]:
-        """Tick of the last state to learn from in the episode of each transition, (batch,)."""
+        """Tick of the state after the last valid step in each transition's episode, (batch,)."""
         if self.valid_ticks is None:
             return np.full(len(self.row), self.episodes.ticks)
         return self.valid_ticks.take(self.row)
 
     def select(self, chosen: NDArray[np.intp]) -> Starts:
-        """Return only the transitions with these indices."""
+        """Return the states of only those transitions of the batch with the indices `chosen`."""
         return Starts(self.episodes, self.row[chosen], self.tick[chosen], self.valid_ticks)
 
 
 @dataclass(frozen=True, slots=True)
 class Transitions:
-    """A batch for one update, float32. The target of the critic is reward + discount * next value.
+    """A batch of transitions for one update of the networks, float32.
 
     Attributes:
         observation: (batch, observation_size).
@@ -231,8 +228,9 @@ class Transitions:
             return.
         goal: (batch, goal_size), after relabelling.
         action: (batch, action_size).
-        reward: (batch,) for `goal`; the discounted sum over an n-step return.
-        discount: (batch,) factor on the value of `next_observation`.
+        reward: (batch,) for `goal`; for an n-step return, the discounted sum of n rewards.
+        discount: (batch,) factor of the value of `next_observation`. The target of the critic is
+            the reward plus this product.
     """
 
     observation: Array32

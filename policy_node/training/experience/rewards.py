@@ -20,13 +20,13 @@ class GradedReward:
     """A reward between -1 and 0 that rises with the number of thresholds met.
 
     The reward is the share of distance thresholds met, minus 1. If the goal has a rotation, this
-    share is multiplied by the share of rotation thresholds met. The sparse reward does not show how
-    nearly a goal was missed or how safely it was met. With the sparse reward, an actor holds an
-    object no better than the threshold requires. If goals have a position and a rotation, that
-    actor neglects one of them as long as it never meets both.
+    share is multiplied by the share of rotation thresholds met. The sparse reward shows
+    neither how nearly a goal was missed nor how safely it was met. An actor trained with the sparse
+    reward holds an object no better than the threshold requires. It also neglects position or
+    rotation as long as it never meets both thresholds at once.
 
     Attributes:
-        metric: Distance and rotation to the goal, and the success thresholds.
+        metric: Computes distance and rotation to the goal; its task has the success thresholds.
         grades: Factors on the success thresholds; (1,) gives the sparse reward.
     """
 
@@ -48,7 +48,7 @@ class GradedReward:
 
 
 def reward_schedule(config: TrainConfig, metric: GoalMetric) -> Callable[[float], RewardFunction]:
-    """Return a function from the progress of a run, 0 ... 1, to the reward function to use then.
+    """Return a function that returns the reward function at a progress of the run, 0 ... 1.
 
     Raises:
         ValueError: If `reward_grades` is set for a third-party task that defines its own reward.
@@ -67,15 +67,15 @@ def reward_schedule(config: TrainConfig, metric: GoalMetric) -> Callable[[float]
 
 
 def own_reward(metric: GoalMetric) -> str:
-    """Return a text for errors that names the reward defined by a third-party task."""
+    """Return the words that name the reward of a third-party task in error messages."""
     return f'the reward of {metric.spec.name} itself ({type(metric).__name__})'
 
 
 def narrowed(metric: GoalMetric, config: TrainConfig, progress: float) -> GoalMetric:
-    """Return `metric` with the success thresholds for this progress of a run, 0 ... 1.
+    """Return a copy of `metric` with the success thresholds at this progress of a run, 0 ... 1.
 
-    At the start, thresholds are multiplied by `first_distance` and `first_rotation`. They reach
-    those of the task after two thirds of the run.
+    At the start, `config.first_distance` and `config.first_rotation` multiply the thresholds. These
+    factors change exponentially and reach 1 after two thirds of the run.
     """
     left = max(1.0 - 1.5 * progress, 0.0)
     distance, rotation = config.first_distance**left, config.first_rotation**left

@@ -32,9 +32,10 @@ class TransitionSampler:
     """Draws transitions from episodes, relabels their goals and computes their rewards.
 
     Attributes:
-        compute_reward: (achieved_goal, desired_goal) -> reward, batched.
+        compute_reward: Function from achieved and desired goals (..., goal_size) to rewards (...,).
         gamma: Discount per tick.
         most_steps: Longest n-step return; 1 for single transitions.
+        reward_scale: Factor of all rewards.
         lost_value: Value of the last valid state of an episode that is cut because the object fell;
             None uses the value of the critic.
         reward_at: Function from the progress of the run, 0 ... 1, to `compute_reward` at that time;
@@ -51,7 +52,7 @@ class TransitionSampler:
     sources: Mapping[str, Source] = field(default_factory=lambda: SOURCES)
 
     def at(self, progress: float) -> TransitionSampler:
-        """Return a sampler with the reward at `progress`, the finished share of the run."""
+        """Return a sampler with the reward at `progress`, the finished share 0 ... 1 of the run."""
         if self.reward_at is None:
             return self
         return replace(self, compute_reward=self.reward_at(progress))
@@ -64,7 +65,7 @@ class TransitionSampler:
         generator: np.random.Generator,
         valid_ticks: NDArray[np.int64] | None = None,
     ) -> Transitions:
-        """Draw one transition from each chosen episode and relabel its goal.
+        """Draw one transition for each entry of `row` and relabel its goal.
 
         Args:
             row: Row number of the episode for each transition, (batch,).
@@ -87,7 +88,7 @@ class TransitionSampler:
     def relabel(
         self, starts: Starts, mixture: dict[str, float], generator: np.random.Generator
     ) -> Array32:
-        """Draw a goal for each transition, (batch, goal_size), from the sources in `mixture`."""
+        """Draw a goal for each transition, (batch, goal_size); `mixture` is as in `sample`."""
         source = draw_sources(mixture, len(starts.row), generator)
         return goals_of(starts, source, list(mixture), generator, self.sources)
 
@@ -125,7 +126,7 @@ class TransitionSampler:
         return self.several(starts, steps, goal, reward_after)
 
     def single(self, starts: Starts, goal: Array32) -> Transitions:
-        """Return transitions of one step each; faster than `several` with `steps` of 1."""
+        """Return transitions of one step each, equal to `several` with `steps` of 1 but faster."""
         episodes, row, tick = starts.episodes, starts.row, starts.tick
         state = row * (episodes.ticks + 1) + tick
         observation = flat(episodes.observation)
@@ -145,8 +146,8 @@ class TransitionSampler:
     ) -> Transitions:
         """Return n-step transitions of the lengths `steps`, (batch,), with discounted rewards.
 
-        `reward_after(achieved, indices)` returns the rewards of achieved goals (n, goal_size).
-        `indices` (n,) are the rows of `goal` with which these achieved goals are compared.
+        `reward_after(achieved, indices)` returns the rewards (n,) of achieved goals (n, goal_size).
+        These are compared with the desired goals `goal[indices]`.
         """
         episodes, row, tick = starts.episodes, starts.row, starts.tick
         total = np.zeros(len(steps))
@@ -165,7 +166,7 @@ class TransitionSampler:
 
 
 def sampler_fields(config: TrainConfig, metric: GoalMetric) -> dict[str, Any]:
-    """Return the arguments of `TransitionSampler` that follow from a configuration, by name.
+    """Return keyword arguments of `TransitionSampler` for a configuration and a goal metric.
 
     Raises:
         ValueError: If `reward_grades` is set for a third-party task that defines its own reward.

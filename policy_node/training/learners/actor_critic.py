@@ -23,8 +23,8 @@ from policy_node.training.machine import Workers
 class Losses:
     """Losses of critic and actor in one update, and the mean value that the critic estimates.
 
-    They stay tensors on the device of the networks, because a conversion to numbers would wait for
-    the device.
+    The scalars stay tensors on the device of the networks, because a conversion to numbers would
+    wait for the device.
     """
 
     critic: Tensor
@@ -83,7 +83,7 @@ class ActorCritic:
 
     @torch.no_grad()
     def average(self) -> None:
-        """Move the averaged actor towards the actor; the trainer calls this once per cycle."""
+        """Move `average_actor` towards the actor by the share 1 - `actor_average`, each cycle."""
         weight = 1.0 - self.config.actor_average
         averaged: list[Tensor] = list(self.average_actor.parameters())
         torch._foreach_lerp_(averaged, [*self.actor_parameters], weight)
@@ -100,7 +100,7 @@ class ActorCritic:
         return self.plain(self.average_actor)
 
     def other_policies(self) -> dict[str, Policy]:
-        """Return further policies to evaluate, by the names of their columns in `progress.csv`."""
+        """Return more policies to evaluate, by column of `progress.csv`; {} unless overridden."""
         return {}
 
     def plain(self, network: MLP) -> Actor:
@@ -138,7 +138,7 @@ def set_learning_rate(optimizer: torch.optim.Adam, config: TrainConfig, progress
 
 
 def network_shape(config: TrainConfig, extra_actions: int = 0) -> NetworkShape:
-    """Return the sizes and inputs of the networks for a task.
+    """Return the sizes and inputs of the networks that `config` describes.
 
     `extra_actions` is the number of actor outputs beside the robot's action.
     """

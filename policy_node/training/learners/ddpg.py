@@ -23,7 +23,7 @@ _ALWAYS = ('observation', 'next_observation', 'goal', 'action', 'reward', 'disco
 
 @dataclass(frozen=True, slots=True)
 class TensorBatch:
-    """A batch as tensors on the device of the networks.
+    """The arrays of `Transitions` as tensors on the device of the networks.
 
     `features` are the network inputs made from `observation` and `goal`, and `next_features` those
     made from `next_observation` and `goal`.
@@ -74,11 +74,11 @@ class CriticLoss:
         return Critic(features + shape.action_size, shape)
 
     def costs(self, learner: DDPG, batch: TensorBatch) -> Tensor:
-        """Return the loss of each transition, (batch,) or (critics, batch)."""
+        """Return the squared errors, (batch,), or (critics, batch) of an ensemble."""
         return self.errors(learner, batch).square()
 
     def errors(self, learner: DDPG, batch: TensorBatch) -> Tensor:
-        """Return the critic's values minus their targets, (batch,) or (critics, batch)."""
+        """Return the values minus their targets, (batch,), or (critics, batch) of an ensemble."""
         with torch.no_grad():
             target = learner.targets(batch.reward, batch.discount, batch.next_features)
         error: Tensor = learner.critic(batch.features, batch.action) - target
@@ -132,7 +132,8 @@ class DDPG(ActorCritic):
     def update(self, batch: Transitions) -> Losses:
         """Update the critic; update the actor and the target networks at their intervals.
 
-        The returned loss and value of the actor come from its last update.
+        The intervals are `policy_delay` and `target_update_interval`. The returned loss and value
+        of the actor come from its last update.
         """
         tensors = self.tensors(batch)
         critic_loss = self._update_critic(tensors)
@@ -178,7 +179,7 @@ class DDPG(ActorCritic):
         return self.clipped(reward + discount * self.critic_loss.pooled(next_value))
 
     def clipped(self, target: Tensor) -> Tensor:
-        """Return targets clipped to the range of returns that rewards in [-1, 0] can have."""
+        """Return targets clipped to the possible returns, `config.lowest_value` ... 0."""
         return target.clamp(self.config.lowest_value, 0.0)
 
     def _update_critic(self, batch: TensorBatch) -> Tensor:
@@ -200,7 +201,7 @@ class DDPG(ActorCritic):
         return loss.detach(), value.detach()
 
     def _value(self, features: Tensor, action: Tensor) -> Tensor:
-        """Return the mean value of the actor's actions, which the actor maximizes; a scalar."""
+        """Return the mean value of the actor's `action`, a scalar that the actor maximizes."""
         value: Tensor = self.critic(features, action).mean()
         return value
 
@@ -226,5 +227,5 @@ class DDPG(ActorCritic):
         return super().modules() | (targets if self._has_targets else {})
 
     def precision(self) -> contextlib.AbstractContextManager[None]:
-        """Return a context in which matrix products use bfloat16, if the run uses it."""
+        """Return a context in which matrix products use bfloat16, if `precision` selects it."""
         return torch.autocast(self.device.type, torch.bfloat16, enabled=self._bfloat16)

@@ -1,4 +1,4 @@
-"""Imagined subgoals, halfway to the goal by value, as a prior on the actor.
+"""Imagine subgoals on the way to a goal, and pull the actor towards its actions for them.
 
 Chane-Sane et al. 2021, "Goal-Conditioned Reinforcement Learning with Imagined Subgoals" (RIS, arXiv
 2107.00541). The actor learns near goals before distant ones. So its action for a distant goal is
@@ -79,7 +79,7 @@ class ImaginingDDPG(DDPG):
         return loss
 
     def _values(self, observation: Tensor, goal: Tensor) -> Tensor:
-        """Return the values (batch,) of states and goals under the actor, averaged over critics."""
+        """Return the values (batch,) of the actor's actions, as the mean over the critics."""
         features = self.actor.features(observation, goal)
         value: Tensor = self.critic(features, self.actor(features))
         return value if value.ndim == 1 else value.mean(dim=0)
@@ -98,7 +98,7 @@ class ImaginingDDPG(DDPG):
     def imagine(self, features: Tensor) -> Tensor:
         """Return subgoals (batch, goal_size) for features (batch, size), in the units of goals.
 
-        The quaternion of a pose is normalized.
+        `features` are network inputs for a state and a goal. Quaternions have unit length.
         """
         normalizer = self.actor.goal_normalizer
         subgoal: Tensor = normalizer.mean + normalizer.std * self.imagination(features)

@@ -36,7 +36,7 @@ _ACTING = {'threshold': 0.0, 'horizon': 1.0}
 
 
 def acting_input(config: TrainConfig) -> float | None:
-    """Return the condition for acting: 0 (the task's threshold), 1 (all steps left), else None."""
+    """Return the actor's condition, 0 for `condition` threshold and 1 for horizon; else None."""
     return _ACTING.get(config.condition)
 
 
@@ -82,9 +82,10 @@ class ThresholdSampler(TransitionSampler):
         goal: Array32,
         generator: np.random.Generator,
     ) -> ConditionedTransitions:
-        """Return transitions, each with a drawn multiple of the success thresholds.
+        """Return transitions with rewards for a drawn multiple of the success thresholds.
 
-        The networks get the logarithm of the multiple as a further input, the condition.
+        The condition is the logarithm of the multiple. `steps` (batch,) are the lengths of n-step
+        returns; `goal` is (batch, goal_size), after relabelling.
         """
         low, high = np.log(SMALLEST_THRESHOLD), np.log(self.widest)
         drawn = np.exp(generator.uniform(low, high, len(starts.row)))
@@ -105,7 +106,7 @@ class ThresholdSampler(TransitionSampler):
 
 @dataclass(frozen=True, kw_only=True)
 class HorizonSampler(TransitionSampler):
-    """Draws how many steps are left; a value is the return of these steps (TDM, arXiv 1802.09081).
+    """Draws how many steps are left; critics learn the return of these (TDM, arXiv 1802.09081).
 
     Attributes:
         ticks: Length of an episode. The condition is the number of steps left, divided by it.
@@ -120,9 +121,10 @@ class HorizonSampler(TransitionSampler):
         goal: Array32,
         generator: np.random.Generator,
     ) -> ConditionedTransitions:
-        """Return transitions whose condition, the share of steps left, is drawn uniformly.
+        """Return transitions whose condition, the share of the episode left, is drawn uniformly.
 
-        The discount is 0 where no step is left after the transition.
+        The discount is 0 where no step is left after the transition. Arguments are those of
+        `TransitionSampler.transitions`.
         """
         left = generator.integers(1, self.ticks + 1, len(starts.row)).astype(np.float64)
         batch = super().transitions(starts, steps, goal, generator)
@@ -149,7 +151,7 @@ class ConditionedDDPG(DDPG):
         return actor, self.critic_loss.make(inputs, shape)
 
     def tensors(self, batch: Transitions) -> TensorBatch:
-        """Return `DDPG` tensors whose last feature is the condition: threshold or steps left."""
+        """Return the tensors of `DDPG`, whose features get the condition as last column."""
         assert isinstance(batch, ConditionedTransitions)
         tensors = super().tensors(batch)
         features = torch.cat([tensors.features, self.tensor(batch.condition)], dim=-1)
@@ -158,7 +160,7 @@ class ConditionedDDPG(DDPG):
         return replace(tensors, features=features, next_features=next_features)
 
     def plain(self, network: MLP) -> Actor:
-        """Return `network` as an actor whose condition input is fixed at `acting_input`."""
+        """Return an `Actor` on the CPU that acts as `network` with the condition `acting_input`."""
         actor = copy.deepcopy(self.actor)
         actor.network = fold(network, actor.shape, _ACTING[self.config.condition])
         return actor.cpu().eval()
@@ -169,7 +171,10 @@ class ConditionedDDPG(DDPG):
 
 
 def fold(network: MLP, shape: NetworkShape, value: float) -> MLP:
-    """Return a copy of a network of `shape` plus one input; this last input is fixed at `value`."""
+    """Return a copy of `network` without its last input, the condition, which is fixed at `value`.
+
+    The other inputs are those of `shape`. The constant becomes part of the first bias.
+    """
     # The new random weights are replaced, so the global generator must not move.
     with torch.random.fork_rng(devices=[]):
         folded = MLP(shape.feature_size, shape.action_size, shape)
@@ -178,7 +183,7 @@ def fold(network: MLP, shape: NetworkShape, value: float) -> MLP:
 
 
 def without_input(tensors: dict[str, Tensor], column: int, value: float) -> dict[str, Tensor]:
-    """Return the tensors of networks without input `column`, as if it always were `value`."""
+    """Return a new `state_dict` whose networks lack input `column`, which is fixed at `value`."""
     changed = {}
     for name in first_weights(tensors):
         weight, bias = tensors[name], name.removesuffix('weight') + 'bias'

@@ -57,7 +57,7 @@ class Ensemble(nn.Module):
 
 
 def members_of(tensors: dict[str, Tensor]) -> list[dict[str, Tensor]]:
-    """Split the tensors of a `Critic` or an `Ensemble` into those of each critic."""
+    """Split the tensors of a `Critic` or `Ensemble` by critic, with the names of a `Critic`."""
     members: dict[int, dict[str, Tensor]] = {}
     for name, value in tensors.items():
         found = _MEMBER.fullmatch(name)
@@ -84,7 +84,7 @@ class EnsembleLoss(CriticLoss):
         self.options = options
 
     def make(self, features: int, shape: NetworkShape) -> nn.Module:
-        """Return a critic, or an `Ensemble` if there are several."""
+        """Return a critic, or an `Ensemble` if the field `critics` is above 1."""
         members = [self.make_one(features, shape) for _ in range(self.options.critics)]
         return members[0] if len(members) == 1 else Ensemble(members)
 
@@ -233,7 +233,7 @@ class AdvantageCritic(nn.Module):
 
 
 class AdvantageDDPG(DDPG):
-    """`DDPG` with an `AdvantageCritic`; arguments as `DDPG`."""
+    """Learner `DDPG` with an `AdvantageCritic` as its critic; its arguments are those of `DDPG`."""
 
     critic: AdvantageCritic
 

@@ -45,7 +45,7 @@ Inputs = tuple[Tensor, Tensor]
 
 
 class DensityRatio(nn.Module):
-    """Two classifiers that estimate q(g|s, a) / q(g|s, a, s'), the weight of a hindsight goal."""
+    """Estimates the weight q(g|s, a) / q(g|s, a, s') of a hindsight goal g with two classifiers."""
 
     def __init__(self, feature_size: int, goal_size: int, action_size: int) -> None:
         super().__init__()
@@ -55,7 +55,10 @@ class DensityRatio(nn.Module):
         self.optimizer = torch.optim.Adam(self.parameters(), lr=_LEARNING_RATE)
 
     def update(self, chosen: Inputs, shuffled: Inputs) -> Tensor:
-        """Train the classifiers; return importance weights of `chosen` goals, (batch,), mean 1."""
+        """Train both classifiers one step; return the weights of `chosen`, (batch,), mean 1.
+
+        `chosen` are inputs with the batch's own goals, `shuffled` with goals of other transitions.
+        """
         logits = [
             (self.before(before).squeeze(-1), self.after(after).squeeze(-1))
             for before, after in (chosen, shuffled)
@@ -76,7 +79,7 @@ class DensityRatio(nn.Module):
 def _difference(goal: Tensor, achieved: Tensor) -> Tensor:
     """Return the difference of two goals as inputs of the classifiers, (batch, goal_size + 1).
 
-    The scaled and clipped difference per axis shows small distances; the logarithm of the distance
+    The scaled, clipped difference of each value shows small distances; the logarithm of the norm
     shows large ones.
     """
     difference = goal - achieved
@@ -96,7 +99,7 @@ def _classifier(inputs: int) -> nn.Sequential:
 
 
 class WeightedDDPG(DDPG):
-    """`DDPG` with importance weights in the loss of the critic; arguments as `DDPG`."""
+    """`DDPG` whose critic loss is weighted with the importance weights of `DensityRatio`."""
 
     def _set_up(self, shape: NetworkShape) -> None:
         sizes = shape.feature_size, shape.goal_size, shape.action_size
@@ -128,7 +131,7 @@ class WeightedDDPG(DDPG):
         return before, torch.cat([before, batch.next_features, led_to], dim=-1)
 
     def importance(self, batch: Transitions) -> Array32:
-        """Train the classifiers on a batch; return its importance weights, (batch,)."""
+        """Train the classifiers on a NumPy batch, without actor and critic; return its weights."""
         weight: Array32 = self._weights(self.tensors(batch)).cpu().numpy()
         return weight
 

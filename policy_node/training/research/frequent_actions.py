@@ -23,13 +23,13 @@ from policy_node.training.learners.ddpg import DDPG, TensorBatch
 
 
 def ticks_of(length: Array32, most: int) -> NDArray[np.int64]:
-    """Convert the actor's output `length` in [-1, 1] to the ticks an action holds, 1 ... `most`."""
+    """Convert the actor's output `length`, [-1, 1], to the nearest number of ticks 1 ... `most`."""
     share = (np.asarray(length, np.float64) + 1.0) / 2.0
     return 1 + np.rint(share * (most - 1)).astype(np.int64)
 
 
 def length_of(ticks: NDArray[np.int64], most: int) -> Array32:
-    """Convert the ticks an action holds, 1 ... `most`, to the actor's output in [-1, 1]."""
+    """Convert the ticks an action holds, 1 ... `most`, to the actor's output; `most` is above 1."""
     return (2.0 * (ticks - 1) / (most - 1) - 1.0).astype(np.float32)
 
 
@@ -72,7 +72,7 @@ class HoldingSampler(TransitionSampler):
     def steps(
         self, starts: Starts, goal: Array32, generator: np.random.Generator
     ) -> NDArray[np.int64]:
-        """Return how many ticks each action still holds, at most up to `starts.last`, (batch,)."""
+        """Return for how many ticks each action still holds, (batch,), not beyond `starts.last`."""
         del goal, generator
         length = starts.episodes.action[starts.row, starts.tick, -1]
         left: NDArray[np.int64] = starts.last - starts.tick
@@ -92,7 +92,7 @@ class HoldingDDPG(DDPG):
 
 
 def plain_actor(actor: Actor, config: TrainConfig) -> Actor:
-    """Return an actor without the output for how long an action holds, if it has this output."""
+    """Return `actor`, or a copy without the output for how long an action holds if it has one."""
     action_size = task_spec(config.task).robot.action_size
     if actor.shape.action_size == action_size:
         return actor
@@ -112,7 +112,7 @@ _FIRST_SCALE = 0.05
 
 
 class PerturbedActors(MemorylessPolicy):
-    """Several actors with perturbed weights; each acts for an equal part of the batch."""
+    """Several actors with perturbed weights; each acts for an equal share of the simulations."""
 
     def __init__(self, actors: list[Actor]) -> None:
         self._actors = actors

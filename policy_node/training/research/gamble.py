@@ -2,9 +2,9 @@
 
 Plappert et al. 2018, request 2: "Consider an environment with a special action which takes the
 agent to a uniformly random state and ends the episode. Such an action would seem to be perfect in
-hindsight if we replay with the goal achieved by the agent in the future." Two Fetch tasks ignore
-their gripper action. Here it is the special action, called a gamble; the random state is called its
-landing. Everything else stays as it is.
+hindsight if we replay with the goal achieved by the agent in the future." FetchReach and FetchPush
+ignore their gripper action. Here it is the special action, called a gamble; the random state is
+called its landing. Everything else stays as it is.
 """
 
 from __future__ import annotations
@@ -30,19 +30,15 @@ _OVER = 1.0
 
 
 class GambleSimulation(Simulation):
-    """Simulations in which a gamble moves the achieved goal at random and ends the motion.
+    """Simulations in which a gamble fixes the observation at a random landing until the next reset.
 
     The landing is drawn like a goal by the generator of the episode, independent of the desired
-    goal. From the gamble to the end of the episode the observation stays constant: the achieved
-    goal at the landing, no velocities, and finger positions of 1 m, which mark a gamble. The
-    physics continue, but are not observed.
+    goal. After a gamble, the observation has the achieved goal at the landing, velocities of 0, and
+    finger positions of 1 m, which mark a gamble. The physics continue, but are not observed.
 
     Args:
-        task: One of `config.GAMBLE_TASKS`.
+        task: One of `config.GAMBLE_TASKS`; this class does not check it.
         **options: Options of `Simulation`.
-
-    Raises:
-        ValueError: If the task uses its gripper, or an option is not allowed.
     """
 
     def __init__(self, task: str, **options: Any) -> None:
@@ -66,7 +62,7 @@ class GambleSimulation(Simulation):
             self._landing[index] = self._task.sample_goal(index, self.generator(index))
 
     def step(self, actions: ArrayLike) -> StepResult:
-        """Step as in `Simulation.step`; a gripper action above 0.9 (a gamble) ends the motion."""
+        """Step as `Simulation.step` does; the first gripper action above 0.9 is a gamble."""
         result = super().step(actions)
         # If a simulation diverged, the action belonged to the episode before.
         may_gamble = ~(self._over | result.diverged)
@@ -78,7 +74,7 @@ class GambleSimulation(Simulation):
         return StepResult(observation, reward, success, result.diverged)
 
     def _freeze(self, ids: NDArray[np.intp], observation: Array) -> None:
-        """Store the constant observation of the simulations `ids`, which have just gambled."""
+        """Store the constant observation of simulations `ids`, made from `observation` (N, ...)."""
         frozen, parts = observation[ids], self._parts
         frozen[:, parts[self.spec.achieved_goal]] = self._landing[ids]
         if self.spec.has_object:
@@ -98,12 +94,12 @@ class GambleSimulation(Simulation):
 
 
 def is_over(observation: NDArray[np.floating], spec: TaskSpec) -> NDArray[np.bool_]:
-    """Return whether a gamble has ended the episode, (...,), from observations (..., size)."""
+    """Return whether observations (..., observation size) follow a gamble, (...,) booleans."""
     return np.asarray(observation[..., _parts(spec)['gripper_state'].start] == _OVER)
 
 
 def without_landings(episodes: Episodes, spec: TaskSpec) -> Episodes:
-    """Replace the achieved goals after each gamble by the last one before it.
+    """Return a copy in which the achieved goal before a gamble replaces all later ones.
 
     So a landing does not count as a motion of the robot.
     """
@@ -117,7 +113,7 @@ def without_landings(episodes: Episodes, spec: TaskSpec) -> Episodes:
 
 
 def _parts(spec: TaskSpec) -> dict[str, slice]:
-    """Return the slice of each part of an observation by name, such as `gripper_state`."""
+    """Return the slice of each part of an observation vector, by name such as `gripper_state`."""
     starts = np.cumsum([0, *(part.size for part in spec.observation)]).tolist()
     return {
         part.name: slice(start, start + part.size)

@@ -43,7 +43,7 @@ _SMALLEST_NORM = 1e-6
 
 
 def subgoals_of(starts: Starts, generator: np.random.Generator | None = None) -> Array32:
-    """Return the subgoals (batch, goal_size) of the states `starts`; `generator` is unused."""
+    """Return the subgoals (batch, goal_size) recorded at `starts`; `generator` is unused."""
     del generator
     episodes = starts.episodes
     size = episodes.desired_goal.shape[-1]
@@ -56,7 +56,7 @@ class Proposer:
 
     Attributes:
         policy: Returns actions (N, goal size) in [-1, 1]. They span `NORMALIZED_CLIP` standard
-            deviations of goals, the range that the networks can distinguish.
+            deviations of goals, the range to which networks clip their input.
         mean: Mean of goals, (goal size,).
         std: Standard deviation of goals, (goal size,).
         is_pose: Whether goals end with a unit quaternion.
@@ -82,11 +82,11 @@ class Proposer:
 
 
 class GuidedPolicy:
-    """Actor and high level as one policy without noise, for whole episodes.
+    """Actor and high level as one policy without noise, which counts the ticks of episodes.
 
     Args:
         every: Number of ticks for which a subgoal holds.
-        ticks: Number of ticks of an episode.
+        ticks: Number of ticks of an episode; then the next call of `predict` begins a new one.
     """
 
     def __init__(self, actor: Policy, proposer: Proposer, every: int, ticks: int) -> None:
@@ -102,7 +102,7 @@ class GuidedPolicy:
         episode_start: Any = None,
         deterministic: bool = True,
     ) -> tuple[NDArray[np.float32], Any]:
-        """Return actions (N, action size) for observations (N, ...); each call is the next tick."""
+        """Return actions (N, action size) for observations (N, ...) of the next tick."""
         del episode_start
         proposer = self.proposer
         if self._tick % self._every == 0:
@@ -169,7 +169,7 @@ _HIGH = 'high_'
 
 
 def with_subgoals(mixture: dict[str, float]) -> dict[str, float]:
-    """Return a mixture of goal sources in which subgoals take half of the share of `real`.
+    """Return a mixture of goal sources in which `subgoal` takes half of the share of `real`.
 
     The source `real` keeps the desired goal of the episode. HAC would replace all of its share,
     because the lowest level of HAC never pursues the goal itself.
@@ -187,10 +187,10 @@ class HierarchicalTransitions(Transitions):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SubgoalSampler(TransitionSampler):
-    """Draws transitions of the high level, each over `subgoal_every` ticks.
+    """Draws transitions of the high level, each as long as a subgoal holds (`most_steps` ticks).
 
-    The actor pursues tested subgoals without noise. If it missed one, the transition ends with the
-    reward `missed_value`, the lowest possible return.
+    The actor pursues tested subgoals without noise. If it missed one, the transition has the reward
+    `missed_value`, the lowest possible return, and no value of a next state.
     """
 
     missed_value: float
@@ -205,7 +205,7 @@ class SubgoalSampler(TransitionSampler):
     ) -> Transitions:
         """Draw transitions of the high level; arguments as `TransitionSampler.sample`.
 
-        `valid_ticks` is ignored. Episodes must have at least as many ticks as a subgoal.
+        `valid_ticks` is ignored. Episodes must have at least `most_steps` ticks.
         """
         del valid_ticks
         starts = Starts(episodes, row, self._ticks(episodes, len(row), generator))
@@ -220,7 +220,8 @@ class SubgoalSampler(TransitionSampler):
     ) -> NDArray[np.int64]:
         """Draw the ticks (count,) at which transitions begin.
 
-        The share `_DECISIONS` begins at ticks with a new subgoal, all others at any tick.
+        The share `_DECISIONS` of them begins at ticks with a new subgoal. The other transitions
+        begin at any tick, but `most_steps` before the end of the episode at the latest.
         """
         last, every = episodes.ticks - self.most_steps, self.most_steps
         decision = every * generator.integers(last // every + 1, size=count)
@@ -228,9 +229,10 @@ class SubgoalSampler(TransitionSampler):
         return np.where(generator.random(count) < _DECISIONS, decision, anywhere)
 
     def _with_tests(self, starts: Starts, batch: Transitions) -> Transitions:
-        """Return the batch with a penalty for tested subgoals that were missed.
+        """Return a copy of the batch with a penalty for tested subgoals that were missed.
 
-        Their transitions have the subgoal as action, the reward `missed_value` and discount 0.
+        Transitions that begin with such a subgoal have it as their action, the reward
+        `missed_value` and discount 0.
         """
         subgoal = subgoals_of(starts)
         pairs = batch.action.astype(np.float64), subgoal.astype(np.float64)
@@ -249,7 +251,7 @@ class HierarchicalExperience(Experience):
     """Batches of both levels from one replay; arguments as `Experience`."""
 
     def batch(self, env_steps: int) -> HierarchicalTransitions:
-        """Draw the transitions of one update of both levels."""
+        """Draw the transitions of one update of both levels; `env_steps` is unused."""
         del env_steps
         config, mixture = self.config, self.mixture()
         low = self._draw(with_subgoals(mixture))
@@ -267,7 +269,7 @@ class HierarchicalExperience(Experience):
 
 
 class HighLevel(DDPG):
-    """`DDPG` of the high level: its actions are goals for `low`, whose normalizers it shares."""
+    """`DDPG` whose actions are goals for the actor of `low`; both share their normalizers."""
 
     def __init__(self, shape: NetworkShape, low: DDPG) -> None:
         # A penalty of large actions would prefer goals in the middle of all goals.
@@ -285,7 +287,7 @@ class HighLevel(DDPG):
         return replace(tensors, action=action)
 
     def proposer(self, averaged: bool = False) -> Proposer:
-        """Return a copy on the CPU that proposes subgoals, with averaged weights if `averaged`."""
+        """Return a CPU copy of this level as a `Proposer`, with averaged weights if `averaged`."""
         actor = self.plain(self.average_actor if averaged else self.actor.network)
         normalizer = actor.goal_normalizer
         return Proposer(actor, normalizer.mean.numpy(), normalizer.std.numpy(), self._is_pose)
@@ -298,7 +300,7 @@ class HierarchicalDDPG(DDPG):
         self.high = HighLevel(shape, self)
 
     def update(self, batch: Transitions) -> Losses:
-        """Update both levels on a batch; return the losses of the low level."""
+        """Update both levels on a batch; return the losses of the actor and its critic."""
         assert isinstance(batch, HierarchicalTransitions)
         # A training state contains only the number of updates of the actor.
         self.high.updates = self.updates
@@ -306,7 +308,7 @@ class HierarchicalDDPG(DDPG):
         return super().update(batch)
 
     def average(self) -> None:
-        """Move the averaged actors of both levels towards the actors."""
+        """Move the averaged actor of each level towards its actor; called once per cycle."""
         super().average()
         self.high.average()
 
@@ -316,12 +318,12 @@ class HierarchicalDDPG(DDPG):
         self.high.set_progress(progress)
 
     def acting_policy(self) -> Policy:
-        """Return the policy that collects: the actor before the first update, then both levels."""
+        """Return both levels as one policy to collect episodes; before any update, the actor."""
         actor = super().acting_policy()
         return self._guided(actor, self.high.proposer()) if self.updates else actor
 
     def other_policies(self) -> dict[str, Policy]:
-        """Return both levels as one policy, named `eval_guided`; {} before the first update."""
+        """Return both levels as one policy to evaluate, `eval_guided`; {} before any update."""
         if not self.updates:
             return {}
         both = self._guided(self.evaluation_actor(), self.high.proposer(averaged=True))

@@ -4,8 +4,8 @@ An n-step return propagates rewards n times as fast. But it contains the actions
 that the actor would take now. `correction=lambda` draws the number of steps from a geometric
 distribution cut at n. The mean target is then the truncated lambda-return (Sutton and Barto 2018,
 12.3); the average of MHER(lambda) (arXiv 2102.12962) gives the longest return less weight.
-`correction=cut` ends a return before the first action that is far from the actor's action for the
-same goal.
+`correction=cut` ends a return before the first action that differs from the actor's action for the
+same goal by more than `cut_distance`.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ CANDIDATES = 8
 
 @torch.no_grad()
 def bellman(learner: DDPG, batch: Transitions) -> Array32:
-    """Return the absolute Bellman error of each transition, (batch,), averaged over critics."""
+    """Return |value - target| of each transition, (batch,), averaged over the critics."""
     with learner.precision():
         errors = CriticLoss.errors(learner.critic_loss, learner, learner.tensors(batch))
     error = errors.abs().float()
@@ -40,7 +40,7 @@ def bellman(learner: DDPG, batch: Transitions) -> Array32:
 
 @torch.no_grad()
 def uncertain(learner: DDPG, batch: Transitions) -> Array32:
-    """Return the standard deviation over critics of each transition's value, (batch,)."""
+    """Return the standard deviation of the critics' values of each transition, (batch,)."""
     tensors = learner.tensors(batch)
     with learner.precision():
         value = learner.critic(tensors.features, tensors.action).float()
@@ -57,12 +57,11 @@ SCORES: dict[str, Callable[[DDPG, Transitions], Array32]] = {
 
 @dataclass(frozen=True, kw_only=True)
 class ChoosingSampler(TransitionSampler):
-    """Draws several future goals per transition and keeps the one that `choice` ranks first.
+    """Draws 8 future goals per transition and keeps the one with the highest score.
 
     Attributes:
-        judge: The learner whose critics rank the goals.
-        choice: `bellman` (largest error of the value) or `uncertain` (largest difference between
-            critics).
+        judge: The learner whose critics score the goals.
+        choice: The score, `bellman` (error of the value) or `uncertain` (spread of the critics).
     """
 
     judge: DDPG
@@ -71,7 +70,7 @@ class ChoosingSampler(TransitionSampler):
     def relabel(
         self, starts: Starts, mixture: dict[str, float], generator: np.random.Generator
     ) -> Array32:
-        """Draw a goal for each transition; choose each future goal from several candidates."""
+        """Draw a goal for each transition, (batch, goal_size); choose future goals by score."""
         source = draw_sources(mixture, len(starts.row), generator)
         goal = goals_of(starts, source, list(mixture), generator)
         rows = np.flatnonzero(np.array(list(mixture))[source] == 'future')
@@ -80,7 +79,7 @@ class ChoosingSampler(TransitionSampler):
         return goal
 
     def _best(self, starts: Starts, first: Array32, generator: np.random.Generator) -> Array32:
-        """Return the goals that `choice` ranks first among `first` and newly drawn future goals."""
+        """Return the goals with the highest scores among `first` and seven new future goals each."""
         candidates, source = [first], np.zeros(len(first), np.intp)
         for _ in range(CANDIDATES - 1):
             candidates.append(goals_of(starts, source, ['future'], generator))
@@ -94,14 +93,14 @@ class ChoosingSampler(TransitionSampler):
 
 @dataclass(frozen=True, kw_only=True)
 class LambdaSampler(TransitionSampler):
-    """Draws n-step returns of random n; their mean is the truncated lambda-return of `trace`."""
+    """Draws returns of random n; their mean is the truncated lambda-return with lambda `trace`."""
 
     trace: float = 0.7
 
     def steps(
         self, starts: Starts, goal: Array32, generator: np.random.Generator
     ) -> NDArray[np.int64]:
-        """Draw the length of each n-step return in steps, (batch,)."""
+        """Draw the length of each n-step return, (batch,): 1 step or more, up to `most_steps`."""
         most = super().steps(starts, goal, generator)
         return np.minimum(generator.geometric(1.0 - self.trace, len(most)), most)
 
@@ -111,8 +110,8 @@ class CuttingSampler(TransitionSampler):
     """Ends n-step returns before the first action that is far from the actor's action.
 
     Attributes:
-        judge: The learner with the actor to compare with.
-        cut_distance: Largest distance (root mean square) between the two actions in a return.
+        judge: The learner whose actor gives the action to compare with.
+        cut_distance: Largest root mean square distance of an action in a return from that action.
     """
 
     judge: DDPG
@@ -121,7 +120,7 @@ class CuttingSampler(TransitionSampler):
     def steps(
         self, starts: Starts, goal: Array32, generator: np.random.Generator
     ) -> NDArray[np.int64]:
-        """Return the length of each n-step return in steps, (batch,)."""
+        """Return the length of each n-step return, (batch,): 1 step or more, up to `most_steps`."""
         most = super().steps(starts, goal, generator)
         steps = np.ones_like(most)
         episodes = starts.episodes

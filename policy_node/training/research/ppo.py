@@ -2,8 +2,8 @@
 
 The policy is the actor with Gaussian noise of `noise_std`, clipped to the range of actions as in
 the collector. The density of a clipped action is the probability of noise beyond the limit (Fujita
-& Maeda 2018, arXiv 1802.07564). So densities are those with which actions were drawn, except that
-the normalizers already include the new episodes. From the fourth cycle on, this hardly matters.
+& Maeda 2018, arXiv 1802.07564). The normalizers include the new episodes when densities are
+computed, but not when actions are drawn. From the fourth cycle on, this hardly matters.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ class RolloutTransitions(Transitions):
 
     Attributes:
         log_probability: Log density of the action, (batch,), for the actor before the first update
-            on these rollouts. Its normalizers include the new episodes already.
-        advantage: Advantage of the action, (batch,), with standard deviation 1.
-        value_target: Target for the value of the state, (batch,).
-        weight: Weight of the transition in all losses, (batch,).
+            on these rollouts.
+        advantage: Advantage of the action, (batch,), with weighted mean 0 and deviation 1.
+        value_target: Value of the state that the critic should return, (batch,).
+        weight: Weight of the transition in the losses of critic and actor, (batch,).
     """
 
     log_probability: Array32
@@ -65,7 +65,7 @@ class PPO(ActorCritic):
         super().__init__(actor, critic, config, device, workers)
 
     def update(self, batch: Transitions) -> Losses:
-        """Improve critic and actor by one gradient update on a batch of rollouts."""
+        """Update critic and (after `critic_first` updates) actor once on `RolloutTransitions`."""
         assert isinstance(batch, RolloutTransitions)
         features = self.actor.features(self.tensor(batch.observation), self.tensor(batch.goal))
         weight = self.tensor(batch.weight)
@@ -92,14 +92,14 @@ class PPO(ActorCritic):
 
     @torch.no_grad()
     def values(self, observation: Array32, goal: Array32) -> Array32:
-        """Return values (...,) of states (..., observation_size) for goals (..., goal_size)."""
+        """Return the critic's values (...,) of states (..., size) for goals (..., goal_size)."""
         features = self.actor.features(self.tensor(observation), self.tensor(goal))
         value: Array32 = self.critic(features).squeeze(-1).cpu().numpy()
         return value
 
     @torch.no_grad()
     def log_probabilities(self, observation: Array32, goal: Array32, action: Array32) -> Array32:
-        """Return the log densities (...,) of actions (..., action_size) in states with goals."""
+        """Return log densities (...,) of actions (..., action_size) for the actor with noise."""
         mean = self.actor(self.actor.features(self.tensor(observation), self.tensor(goal)))
         logs = log_probability(mean, self._noise_std, self.tensor(action))
         found: Array32 = logs.cpu().numpy()

@@ -1,4 +1,4 @@
-"""Select simulation, collector, sampler and learner of a run: the usual or those of a study.
+"""Select the simulation, collector, sampler and learner of a run by its configuration.
 
 This is the only module of the folder that other folders import.
 """
@@ -78,7 +78,7 @@ def make_simulation(config: TrainConfig, num_envs: int, num_threads: int) -> Sim
 
 
 def make_collector(simulation: Simulation, seeds: list[int], config: TrainConfig) -> Collector:
-    """Return the collector that the configuration selects; arguments as `Collector`."""
+    """Return the collector that the configuration selects; `seeds` has one per simulation."""
     if config.longest_hold > 1:
         return frequent_actions.HoldingCollector(simulation, seeds, config)
     if config.subgoal_every:
@@ -92,8 +92,8 @@ def make_sampler(
 ) -> TransitionSampler:
     """Return the sampler of transitions that the configuration selects.
 
-    `ChoosingSampler` and `CuttingSampler` need a learner, `judge`. Without it, `TransitionSampler`
-    takes their place.
+    `judge` is the learner that `ChoosingSampler` and `CuttingSampler` need. Without it,
+    `TransitionSampler` takes their place.
 
     Raises:
         ValueError: If the configuration would replace the reward that a third-party task defines.
@@ -149,7 +149,7 @@ def make_learner(
 def make_ddpg(
     shape: NetworkShape, config: TrainConfig, device: torch.device, workers: Workers
 ) -> DDPG:
-    """Return the variant of `DDPG` that the configuration selects; arguments as `DDPG`."""
+    """Return the learner that the configuration selects, `DDPG` or a variant of it."""
     kinds = (kind for name, kind in _LEARNERS.items() if getattr(config, name) != DEFAULTS[name])
     return next(kinds, DDPG)(shape, config, device, workers, critics.critic_loss(config))
 
@@ -160,12 +160,12 @@ def network_shape(config: TrainConfig) -> NetworkShape:
 
 
 def _extra_actions(config: TrainConfig) -> int:
-    """Return the number of actor outputs beside the action: 1 for how long it holds, or 0."""
+    """Return 1 if the actor also outputs how long its action is held, else 0."""
     return int(config.longest_hold > 1)
 
 
 def _weights_of(config: TrainConfig, spec: TaskSpec) -> Weigh:
-    """Return a function that weights episodes by 1 if the achieved goal moved, otherwise by 0.
+    """Return a function that gives each episode the weight 1 if its achieved goal moved, else 0.
 
     With `config.gamble`, the jump to a landing does not count as a motion.
     """

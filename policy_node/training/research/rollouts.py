@@ -12,13 +12,12 @@ normalized tick by tick over the replayed episodes, as in that paper. Later rewa
 actions, which were for g as well. So in an advantage each later error is weighted by the ratios of
 the actions between, cut as in V-trace (Espeholt et al. 2018, arXiv 1802.01561).
 
-An episode that is replayed for what it achieved itself always succeeds, so the gradient teaches the
-actor nothing about acting at all: leaving the block alone succeeds, too, and touching it delays
-success (`bench/hindsight_pull.py`). Hindsight policy gradients sum over goals that do not depend on
-the episode. The source `outcome` does the same: outcomes of other episodes, moved to the start of
-this one, without those that are already met there. Of a few candidates, the one nearest to the
-desired goal is taken (as HGG, Ren et al. 2019, arXiv 1906.04279). So goals approach those of the
-task.
+An episode that is replayed for a goal it achieved itself always succeeds. So the gradient does not
+teach the actor to act: leaving the block alone succeeds too, and touching it delays success
+(`bench/hindsight_pull.py`). Hindsight policy gradients sum over goals that do not depend on the
+episode. The source `outcome` also uses such goals. It moves achieved goals of other episodes to the
+start of this one; goals that were met from the start are left out. From eight candidates it takes
+the one nearest to the desired goal (as HGG, Ren et al. 2019, arXiv 1906.04279).
 """
 
 from __future__ import annotations
@@ -69,7 +68,7 @@ class RolloutMaker:
     """Makes transitions with advantages from episodes, for their own and for relabelled goals.
 
     Attributes:
-        critique: Learner that returns the values of states and the densities of actions.
+        critique: Learner that returns values of states and log probabilities of actions.
         compute_reward: (achieved_goal, desired_goal) -> reward, batched.
         trace: The lambda of the advantages.
         corrects: Whether replayed episodes get per-decision weights.
@@ -88,7 +87,8 @@ class RolloutMaker:
             goals: Arrays (episodes, goal_size) of goals for which all episodes are replayed.
 
         Returns:
-            The transitions, episode by episode; advantages have weighted mean 0 and deviation 1.
+            The transitions of all episodes with their own goals, then with each of `goals`.
+            Weighted by `weight`, all advantages have mean 0 and standard deviation 1.
         """
         own = self._under(episodes)
         meant = own['log_probability'] if self.corrects else None
@@ -113,7 +113,7 @@ class RolloutMaker:
 
         Args:
             meant: Log probabilities (episodes, T) of the actions for the goals before relabelling,
-                for importance weights; None if the goals are the original ones.
+                for importance weights; None computes advantages without such weights.
 
         Returns:
             Fields of `RolloutTransitions`, (episodes, T, ...).
@@ -184,7 +184,7 @@ def decision_weights(log_ratio: NDArray[np.floating]) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class Outcomes:
-    """Goals achieved at the start of episodes, and different ones achieved later.
+    """Pairs of goals that an episode achieved at its start and later.
 
     Attributes:
         before: Goals achieved in the first states of episodes, (count, goal_size).
@@ -197,7 +197,7 @@ class Outcomes:
 
     @classmethod
     def of(cls, episodes: Episodes, metric: GoalMetric, generator: np.random.Generator) -> Outcomes:
-        """Draw goals achieved in each episode; keep those not met by its first achieved goal."""
+        """Draw 4 achieved goals of each episode; keep those that its first state did not meet."""
         row = np.repeat(np.arange(len(episodes)), _STATES)
         tick = generator.integers(1, episodes.ticks + 1, size=len(row))
         before, after = episodes.achieved_goal[row, 0], episodes.achieved_goal[row, tick]
@@ -208,10 +208,10 @@ class Outcomes:
         return len(self.after)
 
     def goals(self, starts: Starts, generator: np.random.Generator) -> Array32:
-        """Return one goal per episode, (batch, goal_size): the outcome nearest to the desired goal.
+        """Return for each start the candidate nearest to its desired goal, (batch, goal_size).
 
-        A few outcomes are drawn. The motion from `before` to `after` of each is applied to the goal
-        achieved at the start of the episode. Without outcomes, the desired goals are returned.
+        A candidate is the first achieved goal of the episode, moved as from `before` to `after` of
+        an outcome. Each start has eight. Without outcomes, the desired goals are returned.
         """
         desired = starts.episodes.desired_goal[starts.row]
         if not len(self):
@@ -237,7 +237,7 @@ def goals_in_hindsight(
 
     Args:
         mixture: Probability of each goal source: `future`, `final`, `actual`, ..., `outcome`.
-        outcomes: Goals that other episodes have achieved, for the source `outcome`.
+        outcomes: Goals that other episodes have achieved; needed for the source `outcome`.
     """
     count = len(episodes)
     starts = Starts(episodes, np.arange(count), np.zeros(count, np.int64))
@@ -247,7 +247,7 @@ def goals_in_hindsight(
 
 
 class OnPolicyExperience(Experience):
-    """Episodes of the newest cycle, each with its own goal and `hindsight_k` relabelled ones.
+    """Draws transitions of the newest cycle, for the goals of episodes and `hindsight_k` others.
 
     Args:
         config: The configuration; `trace` is the lambda of the advantages.
@@ -276,7 +276,7 @@ class OnPolicyExperience(Experience):
         self._weight_up_to = np.zeros(0)
 
     def batch(self, env_steps: int) -> Transitions:
-        """Draw transitions of the newest cycle, which are recomputed if `env_steps` has changed."""
+        """Draw transitions of the newest cycle; a new number of `env_steps` marks a new cycle."""
         if self._rollouts is None or env_steps != self._made_after:
             self._rollouts, self._made_after = self._roll_out(), env_steps
         row, ticks = self._draw_rows(), self.replay.ticks

@@ -1,7 +1,8 @@
 """Measure the success rate of a policy under up to ten disturbances and under the presets.
 
-A point is a preset or one of several levels of a disturbance. The result is a JSON file, a CSV file
-and a figure. After an interruption, the same command evaluates only the missing points.
+A point is the undisturbed robot, a preset or one of several levels of a disturbance. The result is
+a JSON file, a CSV file and a figure. After an interruption, the same command evaluates only the
+missing points.
 """
 
 from __future__ import annotations
@@ -105,10 +106,10 @@ def _run(options: argparse.Namespace) -> int:
 def _start(
     options: argparse.Namespace, loaded: LoadedPolicy, simulation: Simulation, file: Path
 ) -> dict[str, Any]:
-    """Return the settings of this evaluation, with the points that `file` already contains.
+    """Return the settings of this evaluation; `points` are those that `file` already contains.
 
     Raises:
-        UsageError: If `file` is not a result of this policy with the same settings.
+        UsageError: If `file` exists, but is not a result of this policy with the same settings.
     """
     result: dict[str, Any] = {
         'policy': Path(options.policy or loaded.task).name,
@@ -156,7 +157,7 @@ def _measure_in_worker(point: Point) -> dict[str, Any]:
 def _measured_in_workers(
     options: argparse.Namespace, missing: Sequence[Point]
 ) -> Iterator[dict[str, Any]]:
-    """Evaluate points in several processes; yield the result of `_measured` for each, in order."""
+    """Evaluate points in `--jobs` processes; yield the result of `_measured` for each, in order."""
     jobs = min(options.jobs, len(missing))
     threads = options.threads or max(1, len(os.sched_getaffinity(0)) // jobs)
     own = argparse.Namespace(**{**vars(options), 'threads': threads})
@@ -177,7 +178,7 @@ def _measure(
     loaded: LoadedPolicy,
     file: Path,
 ) -> None:
-    """Evaluate the points that `result` lacks and add them; write `file` after each of them."""
+    """Evaluate each point that `result` lacks and add it; rewrite `file` after each."""
     missing = [each for each in points(simulation.spec) if each.key not in result['points']]
     if options.jobs > 1 and missing:
         found = _measured_in_workers(options, missing)
@@ -193,7 +194,7 @@ def _measure(
 def _measured(
     options: argparse.Namespace, simulation: Simulation, loaded: LoadedPolicy, point: Point
 ) -> dict[str, Any]:
-    """Evaluate the policy at one point; return its entry of the JSON file, such as its success."""
+    """Evaluate the policy at one point; return its entry of the JSON file with the success rate."""
     simulation.disturbances = point.disturbances
     bounded = replace(loaded, is_bounded=True)
     outcomes = evaluate(simulation, bounded, options.episodes, options.first_seed)
@@ -210,7 +211,7 @@ def _measured(
 
 
 def _to_csv(result: dict[str, Any]) -> bytes:
-    """Return a CSV file with a row per point, a disturbance at one level."""
+    """Return a CSV file; each row has the name, level and success rate of one point."""
     before, after = ['disturbance', 'level', 'success'], ['dropped', 'diverged']
     rows = (
         [*(each[n] for n in before), *each['success_interval_95'], *(each[n] for n in after)]

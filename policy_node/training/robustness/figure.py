@@ -60,9 +60,9 @@ def _panel(axes: Any, labels: list[str], measured: list[Any], undisturbed: float
 
 
 def draw_overview(results: Sequence[Mapping[str, Any]]) -> bytes:
-    """Return a PNG with a row per policy: the highest level of each disturbance it withstands.
+    """Return a PNG table: the highest level of each disturbance that each policy withstands.
 
-    Up to this level the policy keeps 90 % of its undisturbed success.
+    Up to that level the policy keeps 90 % of its undisturbed success. `results` are as in `draw`.
     """
     from matplotlib.figure import Figure
 
@@ -87,7 +87,11 @@ def draw_overview(results: Sequence[Mapping[str, Any]]) -> bytes:
 
 
 def _cell(result: Mapping[str, Any], sweep: Sweep) -> tuple[float, str]:
-    """Return the withstood share of a sweep's levels, and the highest as text; NaN if unknown."""
+    """Return which share of the levels of `sweep` a policy withstands, and the highest as text.
+
+    The text is `< <lowest level>` if even that level is too high. Return NaN and '' if the
+    disturbance needs an object and the task has none.
+    """
     if sweep not in sweeps_of(task_spec(result['task'])):
         return float('nan'), ''
     success = {key: point['success'] for key, point in result['points'].items()}

@@ -18,8 +18,9 @@ class Sweep:
     """One disturbance at rising levels.
 
     Attributes:
+        unit: Unit of the levels as text, such as `rad` or `of half the range`.
         levels: Levels, mildest first.
-        at: Function from a level to the disturbances, as `Disturbances.from_dict` reads them.
+        at: Function from a level to the argument of `Disturbances.from_dict`.
         needs_object: Whether it applies only to tasks with an object.
     """
 
@@ -75,7 +76,7 @@ SWEEPS = (
 
 @dataclass(frozen=True, slots=True)
 class Point:
-    """One evaluation of a curve: a disturbance at a level, a preset (level 1) or `none`."""
+    """An evaluation under a disturbance at a level, a preset (level 1) or `none` (level 0)."""
 
     name: str
     level: float
@@ -83,12 +84,12 @@ class Point:
 
     @property
     def key(self) -> str:
-        """Key of this point in the result file."""
+        """Key of this point in the result file, '<name> <level>', such as 'friction 1.5'."""
         return f'{self.name} {self.level:g}'
 
 
 def points(spec: TaskSpec) -> Iterator[Point]:
-    """Yield the evaluations of a task's robustness curve, the undisturbed one first."""
+    """Yield the undisturbed evaluation, then all levels of the task's sweeps, then the presets."""
     yield Point('none', 0.0, Disturbances())
     for sweep in sweeps_of(spec):
         for level in sweep.levels:
@@ -105,7 +106,7 @@ def sweeps_of(spec: TaskSpec) -> Sequence[Sweep]:
 def kept_up_to(sweep: Sweep, success: Mapping[str, float], undisturbed: float) -> float | None:
     """Return the highest level up to which a policy keeps 90 % of the success rate `undisturbed`.
 
-    `success` has success rates by `Point.key`. Return None if the first level is too high.
+    `success` has success rates by `Point.key`. Return None if it is lower at the first level.
     """
     kept = None
     for level in sweep.levels:

@@ -39,8 +39,8 @@ class Answers:
 
     Args:
         capacity: Largest number of rows; new rows replace the oldest.
-        sizes: Lengths of the parts of a row: an input, an action and, if a critic weights errors,
-            the features of the true state at which the action takes effect.
+        sizes: Lengths of the parts of a row. The parts are an input, an action and, if
+            `value_weight` > 0, the features of the true state in which the action takes effect.
     """
 
     def __init__(self, capacity: int, sizes: Sequence[int]) -> None:
@@ -48,7 +48,7 @@ class Answers:
         self._capacity, self._count = capacity, 0
 
     def add(self, *parts: Tensor) -> None:
-        """Store n rows, given as one tensor (n, size) for each part."""
+        """Store n rows, given as one tensor (n, size) for each part in the order of `sizes`."""
         rows = (self._count + torch.arange(len(parts[0]))) % self._capacity
         for stored, values in zip(self._parts, parts, strict=True):
             stored[rows] = values
@@ -118,7 +118,7 @@ class ImitationTrainer(BaseTrainer):
         return critic.requires_grad_(False)
 
     def train(self, log: RunLog | None = None) -> str:
-        """Train until a limit is reached or `stop` is called; return the reason in words.
+        """Train until `stop` or a limit such as `total_steps`; return the reason as text.
 
         Raises:
             OSError: If a file cannot be written; the earlier files stay.
@@ -144,7 +144,10 @@ class ImitationTrainer(BaseTrainer):
                 return reason
 
     def _collect(self) -> float:
-        """Run an episode in each simulation and store the labels; return the success rate."""
+        """Run the imitating policy for an episode in each simulation; return its success rate.
+
+        The inputs and labels (imitated actions) of undiverged episodes are stored.
+        """
         count = self.config.num_envs
         cycle = self.counters.episodes // count
         simulation = self._simulations[cycle % len(self._simulations)]
@@ -184,7 +187,7 @@ class ImitationTrainer(BaseTrainer):
         return self.actor.features(torch.tensor(seen, dtype=torch.float32), goal)
 
     def _learn(self) -> float:
-        """Fit the actor to the stored actions of the imitated policy; return the mean loss."""
+        """Fit the actor to stored labels, the imitated actions; return the mean loss of a cycle."""
         config, total = self.config, 0.0
         set_learning_rate(self._optimizer, config, self._progress())
         for _ in range(config.updates_per_cycle):

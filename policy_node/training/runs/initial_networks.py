@@ -47,10 +47,10 @@ class InitialNetworks:
     """Networks and normalizer statistics that a run starts from instead of random ones.
 
     Attributes:
-        tensors: Weights and normalizer statistics, by their names in a training state.
+        tensors: Weights and normalizer statistics, by their names in the file `STATE_FILE`.
         shape: Sizes and inputs of the actor.
         goal_features: Value of the field `goal_features` that the networks were trained with.
-        origin: Name, task, environment steps and command of their training, for the record.
+        origin: Record of their training: name, task, environment steps and command line.
         critic_config: Configuration with which the critic was trained; None without a critic.
     """
 
@@ -81,12 +81,11 @@ class InitialNetworks:
 
         - A critic is left out if it was trained with another `norm`, `reward_type` or
           `control_hz`. A critic with another `gamma` stays; `critic_first` lets it adapt.
-        - Past actions may be added as inputs.
-        - If the object's position counts only in the new task, the weights of the goal position
-          become zero. In the old task the goal position equalled that of the object, so the
-          networks have learnt nothing from it. Otherwise an actor that dropped 1 block in 200
-          would drop half.
-        - With the field `condition`, one input is added. Added inputs have zero weights.
+        - Inputs for past actions and for the field `condition` are added with zero weights.
+        - If the object's position counts only in the new task (a `Full` task after a `Rotate`
+          task), the weights of the goal position become zero. In the old task this position
+          equalled the object's, so the networks learnt nothing from it. With the old weights, an
+          actor that dropped 1 block in 200 dropped half.
 
         Raises:
             ValueError: If the run cannot start from these networks.
@@ -112,7 +111,7 @@ class InitialNetworks:
         return fitted._with_critics(0)
 
     def _shape_in(self, config: TrainConfig) -> NetworkShape:
-        """Return `shape`, with the configured number of past actions if it has none."""
+        """Return `shape`; if it has no past actions, with as many as `config` has."""
         past = self.shape.past_actions or config.past_actions
         return replace(self.shape, past_actions=past)
 
@@ -139,10 +138,9 @@ class InitialNetworks:
         return replace(self, tensors=tensors, shape=shape)
 
     def _with_critics(self, critics: int) -> InitialNetworks:
-        """Return a copy for a run with `critics` critics, whose tensors are named as in that run.
+        """Return a copy with up to `critics` critics, named as in a run that has `critics` of them.
 
-        Surplus critics are left out; with `critics` 0 none is kept. The copy may contain fewer than
-        `critics`: `completed` adds them.
+        Surplus critics are left out. Missing ones are added later, by `completed`.
         """
         tensors = {n: v for n, v in self.tensors.items() if not n.startswith(_PREFIXES)}
         if not critics:
@@ -156,7 +154,7 @@ class InitialNetworks:
         return replace(self, tensors=tensors, origin=self.origin | known)
 
     def completed(self, learner: ActorCritic) -> dict[str, Tensor]:
-        """Return all tensors; missing critics are taken from `learner`."""
+        """Return `tensors`; if they have critics, but too few, add critics of `learner`."""
         tensors = dict(self.tensors)
         for part, module in learner.modules().items():
             if given := members_of(part_of(self.tensors, part)):
@@ -189,8 +187,8 @@ def read_initial_networks(name: str) -> InitialNetworks:
             training state of its run folder.
 
     Raises:
-        ValueError: If the actor or run is missing or damaged, its critic belongs to another actor,
-            or its learner makes networks that no other run can start from.
+        ValueError: If the actor or run is missing or damaged, if its critic belongs to another
+            actor, or if its training had one of the fields in `unusual_networks`.
     """
     path = Path(os.path.expanduser(name))
     latest = path / LATEST_FILE
@@ -257,7 +255,7 @@ def _read_usual(file: Path, source: Path) -> tuple[TrainingState, TrainConfig]:
     """Read a training state from `file` and return it with its configuration.
 
     Raises:
-        ValueError: If the file is damaged, or `unusual_networks` lists fields of its training.
+        ValueError: If the file is damaged, or its training had a field in `unusual_networks`.
     """
     state = read_state(file)
     config = config_from_dict(state.extra['config'])
@@ -269,8 +267,8 @@ def _read_usual(file: Path, source: Path) -> tuple[TrainingState, TrainConfig]:
 def _unconditioned(tensors: dict[str, Tensor], config: TrainConfig) -> dict[str, Tensor]:
     """Return networks without the input for `condition` (success threshold or steps left).
 
-    The biases include the constant value of this input with which the actor acts. Networks without
-    such an input are returned unchanged.
+    The biases then include the effect of this input, for the value that it has while the policy
+    acts. Networks without such an input are returned unchanged.
     """
     value = acting_input(config)
     if value is None:
@@ -279,7 +277,7 @@ def _unconditioned(tensors: dict[str, Tensor], config: TrainConfig) -> dict[str,
 
 
 def _sums(mean: Tensor, std: Tensor, count: int) -> dict[str, Tensor]:
-    """Return the buffers of `RunningStatistics`, by name, after `count` inputs of `mean`, `std`."""
+    """Return `RunningStatistics` buffers for `count` inputs with this mean and deviation."""
     number = torch.tensor([float(max(count, 1))], dtype=torch.float64)
     mean, std = mean.double(), std.double()
     square = (std.square() + mean.square()) * number
@@ -310,7 +308,7 @@ def _run_of(part: dict[str, Any], steps: int) -> object:
     """Return a key that is equal for all actors of a run.
 
     `part` is a record of an actor or run, such as `init_from`. The key is the folder of the run. If
-    the folder is unknown, the key consists of the hash or name in `part` and `steps`.
+    the folder is unknown, the key is the pair of the hash or name and the environment `steps`.
     """
     name = part.get('name', '')
     if name and ',' not in name:

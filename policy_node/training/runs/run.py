@@ -79,7 +79,6 @@ class Ending:
     """The end of a run, or of a part of it that may be resumed later.
 
     Attributes:
-        reason: The reason in words.
         counters: Progress of the run at its end.
         signal: Number of the signal that stopped the run; 0 without a signal.
     """
@@ -94,9 +93,7 @@ def resumed_config(
 ) -> TrainConfig:
     """Return the configuration of the run in `folder`, with `changes`, to resume it.
 
-    Args:
-        task: Task that the user gave, which must be that of the run; None if not given.
-        recipe: Recipe that the user gave, which must be that of the run; None if not given.
+    `task` and `recipe` must be those of the run, or None if the user gives none.
 
     Raises:
         ValueError: If the folder contains no run, `task` or `recipe` differ from it, or a field
@@ -130,11 +127,10 @@ def train_run(
     experience: Episodes | None = None,
     caller: Caller | None = None,
 ) -> Ending:
-    """Train in this process until a limit is reached or a signal arrives.
+    """Train in this process until a limit of `config`, a signal or `on_cycle` ends the run.
 
     Args:
-        output: Folder of the run.
-        resume: Continue the run in the folder; otherwise the folder must contain no run.
+        resume: Continue the run in the folder `output`; otherwise it must contain no run.
         command: Command line or call that started the run, for the record.
         experience: Logged episodes to learn from in addition to collected ones, or None.
         caller: The calling Python program; None if a command started the run.
@@ -181,7 +177,9 @@ def _make_trainer(
     resume: bool,
     experience: Episodes | None,
 ) -> AnyTrainer:
-    """Return a trainer, new with `networks` or resumed from `output`, with logged episodes added.
+    """Return a trainer with the logged episodes added, new or with `resume` that of `output`.
+
+    A new trainer starts with `networks`, or with random ones if they are None.
 
     Raises:
         ValueError: If the training state or the logged episodes do not fit the configuration, or

@@ -48,9 +48,9 @@ def companion_file(actor: Path) -> Path:
 
 
 def set_former_run_aside(folder: Path) -> str:
-    """Move the files of an earlier run without a training state into a subfolder `former*`.
+    """Move the actors, replay and logs of an earlier run into a new subfolder `former*`.
 
-    Otherwise the new run would append to the earlier log or keep the earlier best actor.
+    Otherwise a new run in `folder` would append to the earlier log or keep the earlier best actor.
 
     Returns:
         A sentence that names both folders; '' if there were no files.
@@ -73,8 +73,7 @@ class RunFolder:
     """Writes the actors, the training state and the replay of a run on one worker.
 
     Attributes:
-        path: The folder.
-        workers: This worker. Only the first worker writes actors and the training state.
+        workers: Rank of this worker. Only the first worker writes actors and the training state.
         command: Command line or call that started the run, for the record.
         init_from: Origin of the initial networks; empty if they were random.
     """
@@ -94,10 +93,10 @@ class RunFolder:
         return self.path / (REPLAY_FILE if rank == 0 else f'{rank}.{REPLAY_FILE}')
 
     def keep_best(self, outcomes: EpisodeOutcomes, actor: Actor, counters: Counters) -> None:
-        """Save an evaluated actor if its success, or at equal success its return, is the highest.
+        """Save an evaluated actor if its success rate is the highest of the run so far.
 
-        `counters` gets the new best success and return. An evaluation that ended early
-        has no effect.
+        At equal success rates, the mean return decides. `counters` gets both values of the new best
+        actor. Evaluations of fewer than `evaluation_episodes` episodes have no effect.
         """
         rule = self.config.success_rule
         success = success_rate(outcomes, rule)
@@ -114,9 +113,9 @@ class RunFolder:
     def read_best(self, counters: Counters) -> None:
         """Set the best success and return of a resumed run, in `counters`, from its best actor.
 
-        The best actor may be newer than the training state. Success and return are reset if its
-        file is missing, damaged or of another task, or if it was evaluated on fewer episodes or by
-        another `success_rule`. Then the next evaluated actor replaces it.
+        The best actor may be newer than the training state. Its file may be missing, damaged or of
+        another task, or its evaluation may have had fewer episodes or another `success_rule`. Then
+        both values become those of a new run, so that the next evaluated actor replaces it.
         """
         file, rule = self.path / BEST_FILE, self.config.success_rule
         if counters.best_success < 0 and not file.is_file():
@@ -140,7 +139,7 @@ class RunFolder:
     def save_when_due(
         self, learner: ActorCritic, experience: Experience, counters: Counters
     ) -> None:
-        """Write a checkpoint if the last is `checkpoint_seconds` old; add the replay every 900 s.
+        """Call `save` when the last checkpoint is `checkpoint_seconds` old; add replay every 900 s.
 
         If a file cannot be written, for example on a full disk, only warn.
         """
@@ -160,7 +159,7 @@ class RunFolder:
         counters: Counters,
         with_replay: bool = True,
     ) -> None:
-        """Write a checkpoint: newest episodes and, on the first worker, actor and training state.
+        """Write the newest episodes and, on the first worker, the actor and the training state.
 
         Without `with_replay`, the earlier file of episodes stays.
 

@@ -150,7 +150,7 @@ class RunLog:
 
 
 def evaluation_columns(outcomes: EpisodeOutcomes | None, success_rule: str) -> Row:
-    """Return outcomes as columns of `progress.csv`, success by `success_rule`; empty for None."""
+    """Return an evaluation as columns of `progress.csv`, success by `success_rule`; {} for None."""
     if outcomes is None:
         return {}
     found = {f'eval_{n}': value for n, value in diagnose(outcomes).items() if n != 'long_way_share'}
@@ -163,7 +163,7 @@ def evaluation_columns(outcomes: EpisodeOutcomes | None, success_rule: str) -> R
 
 
 def loss_columns(losses: Sequence[Losses]) -> Row:
-    """Return the mean losses of a cycle by column of `progress.csv`, each None without updates."""
+    """Return the mean losses of a cycle by column of `progress.csv`; all None without updates."""
     found: Row = {}
     for name, column in _LOSS_COLUMNS.items():
         values = [getattr(loss, name) for loss in losses]
@@ -182,14 +182,14 @@ def _clock(seconds: float) -> str:
 
 
 def _rows_until(path: Path, env_steps: int) -> list[dict[str, str]]:
-    """Return the rows of a log up to `env_steps`, as text; empty for 0 steps or without a log."""
+    """Return the rows up to and with `env_steps`, as text; [] for 0 steps or without a log."""
     if env_steps == 0 or not path.is_file():
         return []
     return [row for row, numbers in _valid_rows(path) if numbers['env_steps'] <= env_steps]
 
 
 def _valid_rows(path: str | Path) -> Iterator[tuple[dict[str, str], dict[str, float]]]:
-    """Yield each row of a log twice: as text, and as numbers without empty columns.
+    """Yield each row of a log as a pair of its texts and its numbers, which lack empty columns.
 
     Damaged rows are left out, for example a last row that a killed run wrote only in part.
     """

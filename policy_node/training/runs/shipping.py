@@ -46,15 +46,15 @@ def ship(
 ) -> bool:
     """Evaluate an actor of a run; copy it with its files if it is better than the shipped one.
 
-    The better actor has the higher success rate or, at equal rates, the higher mean return.
+    The better actor has the higher success rate or, at equal rates, the higher mean return. The
+    shipped actor is `<task>.safetensors` in the folder `actors`, `<task>_robust.safetensors` for
+    the recipe `robust`.
 
     Args:
-        actors: Folder of the shipped actors.
-        episodes: Number of evaluated episodes.
         name: File of the actor in `run`.
 
     Returns:
-        True if this actor is now the shipped one, also if it was before.
+        True if this actor is now the shipped one, also if it was before; else False.
 
     Raises:
         ValueError: If the actor or its log is missing or damaged, or the shipped actor has another
@@ -116,7 +116,7 @@ def ship(
 
 
 def _read_log(log: Path) -> list[dict[str, float]]:
-    """Return the rows of the log of a run; raise ValueError if it cannot be read or has no row."""
+    """Return the rows of `progress.csv`; raise ValueError if it cannot be read or has no row."""
     try:
         progress = read_progress(log)
     except OSError as error:
@@ -134,10 +134,10 @@ def _write(
     progress: list[dict[str, float]],
     info: ActorInfo,
 ) -> None:
-    """Write the shipped actor with its critic, curve and evaluation: all files or none.
+    """Write the shipped actor with its critic, curve and evaluation `report`: all files or none.
 
-    If `state` is missing, the critic of the former actor is removed. An actor that is a mean of
-    several networks has no curve of its own, so an existing curve stays.
+    If `state` is None, the critic of the former actor is removed. A run without updates, such as
+    a mean of several actors, does not replace an existing curve.
     """
     files = {target: actor}
     if state is not None:
@@ -158,9 +158,9 @@ def _write(
 
 
 def _critic_bytes(state: TrainingState, actor_sha256: str) -> bytes:
-    """Return the contents of the file with the critic, so that other runs can start from the actor.
+    """Return the file contents of the critic, for runs that start from the shipped actor.
 
-    The actor file contains the normalizers; optimizers start fresh.
+    `actor_sha256` records to which actor file the critic belongs. Optimizers are not included.
     """
     tensors = {name: value for name, value in state.tensors.items() if name.startswith('critic.')}
     extra = {'config': state.extra['config'], 'actor_sha256': actor_sha256}

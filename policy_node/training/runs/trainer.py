@@ -116,7 +116,7 @@ class BaseTrainer:
         return self.counters.env_steps / self.config.total_steps
 
     def stop(self, reason: str) -> None:
-        """Make the run end after the current cycle, with a checkpoint; `reason` is in words."""
+        """End the run with a checkpoint after the current cycle; `train` then returns `reason`."""
         self._stop_reason = reason
 
     def _reason_to_stop(self) -> str:
@@ -212,7 +212,7 @@ class Trainer(BaseTrainer):
         return {**self.learner.modules(), **self.experience.statistics}
 
     def _seed(self, env_steps: int) -> np.random.Generator:
-        """Replace `collector` by a new one; return a random generator that draws batches.
+        """Replace `collector` by a new one; return a random generator for drawing batches.
 
         The seeds of both depend on the seed of the run, the worker and `env_steps`.
         """
@@ -258,9 +258,9 @@ class Trainer(BaseTrainer):
             )
 
     def _let_critic_learn_first(self) -> None:
-        """Let only the critics learn in the first `CRITIC_FIRST` updates if `init_from` lacks some.
+        """Let only critics learn in the first `CRITIC_FIRST` updates if `init_from` lacks a critic.
 
-        Do nothing if `critic_first` of the configuration is not 0, because it sets the number.
+        Do nothing if the configuration sets this number itself (`critic_first` is not 0).
         """
         origin = self._folder.init_from
         critics = self.config.critics
@@ -371,9 +371,9 @@ class Trainer(BaseTrainer):
                 return None
 
     def _prepare_collection(self, may_evaluate: bool = True) -> tuple[Policy, Candidate | None]:
-        """Set the exploration noise; return the policy that collects, and the actor to evaluate.
+        """Set the exploration noise; return the policy that collects and the one to evaluate.
 
-        Without a due evaluation, or if `may_evaluate` is False, None takes the place of the actor.
+        The second value, of `_candidate`, is None if no evaluation is due or allowed.
         """
         counters, steps = self.counters, self.counters.env_steps
         self.collector.exploration = self._exploration()
@@ -386,8 +386,8 @@ class Trainer(BaseTrainer):
     def _candidate(self) -> Candidate | None:
         """Return the actor to evaluate and other policies; None on all workers but the first.
 
-        An example of another policy is both levels of a hierarchy together. The success of the
-        other policies appears only in `progress.csv`.
+        Other policies, such as both levels of a hierarchy together, are evaluated only for
+        `progress.csv`.
         """
         if not self.workers.is_first:
             return None
@@ -451,7 +451,7 @@ class Trainer(BaseTrainer):
         return losses
 
     def save(self) -> None:
-        """Write a checkpoint: newest episodes and, on the first worker, actor and training state.
+        """Write the replay's newest episodes; on the first worker, also actor and training state.
 
         Raises:
             OSError: If a file cannot be written; the earlier files stay.

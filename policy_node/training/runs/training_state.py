@@ -43,8 +43,8 @@ class Counters:
         seconds: Wall-clock time.
         processor_seconds: CPU time of all threads of this process.
         best_success: Best evaluated success rate; -1 before the first evaluation.
-        best_return: Mean return of that evaluation.
-        next_evaluation: Environment steps at which the next evaluation is due.
+        best_return: Mean return in the evaluation of `best_success`.
+        next_evaluation: Value of `env_steps` at which the next evaluation is due.
     """
 
     env_steps: int = 0
@@ -58,7 +58,7 @@ class Counters:
 
 
 class RunClock:
-    """Measures the wall-clock and CPU time of a run, from its first start on, for `counters`."""
+    """Adds the wall-clock and CPU time since the clock was created to those in `counters`."""
 
     def __init__(self, counters: Counters) -> None:
         self._counters = counters
@@ -66,7 +66,7 @@ class RunClock:
         self._cpu_start = time.process_time() - counters.processor_seconds
 
     def update(self) -> None:
-        """Set `seconds` and `processor_seconds` of the counters to the time until now."""
+        """Set `seconds` and `processor_seconds` of the counters to the totals until now."""
         self._counters.seconds = time.monotonic() - self._wall_start
         self._counters.processor_seconds = time.process_time() - self._cpu_start
 
@@ -78,7 +78,8 @@ class TrainingState:
     Attributes:
         tensors: Tensors by part and name, for example `critic.network.output.bias`.
         counters: Progress of the run.
-        extra: JSON values: configuration, command, origin of the initial networks.
+        extra: JSON values. `config` is the configuration; `command` and `init_from` (origin of the
+            initial networks) may be missing.
     """
 
     tensors: dict[str, Tensor]
@@ -95,7 +96,7 @@ def save_state(
 ) -> None:
     """Write all that a resumed run needs, except the replay, to the file `path`.
 
-    `statistics` are those of the normalizers, by name; `extra` contains JSON values.
+    `statistics` are the modules of the normalizers by name; for `extra` see `TrainingState`.
     """
     tensors: dict[str, Tensor] = {'torch_generator': torch.get_rng_state()}
     for part, module in {**learner.modules(), **statistics}.items():
@@ -119,9 +120,9 @@ def state_bytes(state: TrainingState) -> bytes:
 
 
 def require_readable(learner: ActorCritic) -> None:
-    """Raise ValueError if the actor file would exceed 64 MiB, or the training state file 1 GiB.
+    """Raise ValueError if the networks of `learner` are too large for the files of a run.
 
-    This project reads no larger files. The trainer calls this function before it trains for hours.
+    The actor file may have 64 MiB, the training state file 1 GiB. Larger files cannot be read.
     """
     actor = sum(value.nbytes for value in learner.actor.state_dict().values())
     modules, optimizers = learner.modules().values(), learner.optimizers().values()
@@ -201,7 +202,8 @@ def is_finite(value: object) -> TypeGuard[int | float]:
 def load_state(path: Path, learner: ActorCritic, modules: dict[str, nn.Module]) -> TrainingState:
     """Load a training state file into `modules` and into the optimizers of `learner`; return it.
 
-    The random generator of torch is restored too.
+    `modules` are the networks and normalizer statistics by name. The random generator of torch
+    and `learner.updates` are restored too.
 
     Raises:
         ValueError: If the file is not a training state or its tensors do not fit.
@@ -220,11 +222,10 @@ def load_state(path: Path, learner: ActorCritic, modules: dict[str, nn.Module]) 
 
 @contextmanager
 def fitting(source: object) -> Iterator[None]:
-    """Context manager for a block that loads the tensors of `source`, the name of a file or policy.
+    """Context manager that converts errors of a block that loads tensors to a ValueError.
 
-    Raises:
-        ValueError: If the block raises because tensors do not fit the networks of the
-            configuration; the message is one line with `source`.
+    The errors are RuntimeError, KeyError, TypeError and ValueError. The message, one line, reports
+    that `source`, the file or policy of the tensors, does not fit the configuration.
     """
     try:
         yield
@@ -240,11 +241,12 @@ def fitting(source: object) -> Iterator[None]:
 def load_networks(tensors: dict[str, Tensor], modules: dict[str, nn.Module]) -> None:
     """Load `tensors` into `modules`, the networks and normalizer statistics by name.
 
-    Missing target networks and a missing averaged actor become copies of actor and critic. If the
-    critic is missing, its module keeps its weights.
+    Missing target networks and a missing averaged actor become copies of actor and critic. A
+    missing critic, or other module except actors and statistics, keeps its weights.
 
     Raises:
-        RuntimeError: If sizes do not fit, or tensors other than a whole critic are missing.
+        RuntimeError: If sizes do not fit, if an actor or statistics are missing, or if some
+            tensors of a module are.
     """
     tensors = _with_copies(tensors, modules)
     for part, module in modules.items():
@@ -306,7 +308,7 @@ class TrainingError(RuntimeError):
 
 
 def require_finite(values: Iterable[tuple[str, Any]], counters: Counters) -> None:
-    """Raise `TrainingError`, with the steps of `counters`, if a named value has NaN or infinity."""
+    """Raise `TrainingError` with `counters` if a number or array, (name, value), is not finite."""
     for name, value in values:
         if not np.isfinite(np.asarray(value)).all():
             raise TrainingError(

@@ -56,7 +56,7 @@ _OVERLAPPING = {'overlap': True, 'precision': 'auto'}
 
 
 def _start(task: str) -> Start:
-    """Return the start of `task`: the task that trains its networks, and fine-tuning fields."""
+    """Return the task whose networks `task` starts from, and the fields to fine-tune them."""
     coarse = _COARSE_FIRST if task_spec(task).position_counts else {}
     held = _HELD if 'Pen' in task else {}
     return Start(_STARTS_FROM[task], {**_FINE_TUNING, **coarse, **held})

@@ -153,7 +153,7 @@ def jobs_from_arguments(options: argparse.Namespace) -> list[Job]:
 
 
 def _overrides(options: argparse.Namespace, study: Study) -> dict[str, Any]:
-    """Return the fields of `TrainConfig` that the options set for all jobs."""
+    """Return the `TrainConfig` fields that the options set for all jobs, or raise ValueError."""
     chosen = {
         'total_steps': options.steps,
         'simulation_threads': options.threads,
@@ -217,7 +217,7 @@ def _run(options: argparse.Namespace, command: str) -> int:
 
 
 def _not_stored(jobs: Sequence[Job], folder: Path) -> list[Job]:
-    """Return the jobs whose runs the report folder lacks; print how many runs it contains."""
+    """Return the jobs whose runs are not in the report `folder`; print how many runs are in it."""
     runs = read_runs(folder)
     missing = [job for job in jobs if not holds(runs, job)]
     if len(missing) < len(jobs):
@@ -229,7 +229,7 @@ def _not_stored(jobs: Sequence[Job], folder: Path) -> list[Job]:
 def _place(
     options: argparse.Namespace, report: Path, command: str
 ) -> contextlib.AbstractContextManager[Place]:
-    """Return the place where jobs run, by `--jobs` and `--ray`: this process, several or Ray."""
+    """Return a context manager of the place where jobs run, chosen by `--jobs` and `--ray`."""
     cores = len(os.sched_getaffinity(0))
     limit = options.jobs or (cores if options.study.ships else 1)
     if options.ray:
@@ -242,7 +242,8 @@ def _place(
 def _ship_all(options: argparse.Namespace, jobs: Sequence[Job], output: Path, report: Path) -> bool:
     """Evaluate the best actor of each job; copy it to `--actors` if it beats the actor there.
 
-    Return False if an evaluation or a copy failed.
+    Return False if an evaluation or a copy failed. Otherwise write a table of the actors to the
+    folder `report` and return True. Jobs without a best actor are skipped with a message.
     """
     actors, whole = options.actors or output / 'actors', True
     for job in jobs:

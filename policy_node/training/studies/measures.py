@@ -94,7 +94,7 @@ def measure_run(job: Job, command: str) -> dict[str, Any]:
 
 
 def _final_success(job: Job) -> float | None:
-    """Return the success rate of the last actor on fresh episodes; None for 0 `final_episodes`.
+    """Return the success rate of the last actor on `final_episodes` new episodes; None for 0.
 
     All jobs are measured on the same seeds, which training and its evaluations never use.
     """
@@ -137,9 +137,9 @@ def sum_up(runs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Return medians and quartiles over the seeds of one variant: one row of `arms.csv`.
 
     Args:
-        runs: Runs of the variant, as in `runs.jsonl`, with `area_in_time`. This is None if the
-            baseline has no run on the same machine. Measures of time exclude such runs; the
-            column `timed` counts the included ones.
+        runs: Lines of `runs.jsonl` of the variant, with `area_in_time` added. `area_in_time` is
+            None if the baseline has no run on the same machine. Measures of time exclude such
+            runs; the column `timed` counts the included ones.
     """
     first, name_of_steps = runs[0], f'steps_to_{GOOD_SUCCESS}'
     timed = [run for run in runs if run['area_in_time'] is not None]
@@ -159,7 +159,7 @@ def sum_up(runs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def _quartiles(name: str, values: Sequence[float]) -> dict[str, float | str]:
-    """Return median and quartiles by column of `arms.csv`; the columns are empty without values."""
+    """Return quartiles and median as `<name>_lower`, `_median`, `_upper`; '' without values."""
     parts = ('lower', 'median', 'upper')
     if not values:
         return {f'{name}_{part}': '' for part in parts}
@@ -181,7 +181,7 @@ def is_significant(arm: Mapping[str, Any], baseline: Mapping[str, Any], name: st
 def compared(
     runs: Sequence[Mapping[str, Any]], baseline: Sequence[Mapping[str, Any]]
 ) -> dict[str, float | str]:
-    """Return the rank-sum p-value of each measure, by `<measure>_p`; '' without values."""
+    """Return rank-sum p-values of `runs` against `baseline` by `<measure>_p`; '' without values."""
     found: dict[str, float | str] = {}
     for name in COMPARED:
         first, second = (

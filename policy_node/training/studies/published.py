@@ -1,7 +1,7 @@
 """Tables of shipped actors, and published success rates to compare them with.
 
-The paper gives curves but no numbers. So `RERUN` contains results of others, who ran its code and
-configuration again at about its budget. `BEST` contains the best known results of any method.
+The paper gives curves but no numbers. So `RERUN` contains results of other authors, who ran the
+paper's code and configuration at about its budget. `BEST` has the best known results of any method.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class Published:
     """A published success rate.
 
     Attributes:
-        success: Success at the last step, as text.
+        success: Success rate at the last step, as text such as `0.994 +- 0.009`.
         kind: How it was read: `exact`, `quoted` (second-hand) or `figure` (off a figure).
     """
 
@@ -83,7 +83,7 @@ _NOT_PUBLISHED = 'no number found'
 
 
 def actors_table(actors: Path) -> str:
-    """Return a Markdown table with a row for each evaluation `<task>.json` in a folder.
+    """Return a Markdown table with success, return and steps of each `<task>.json` in a folder.
 
     Raises:
         ValueError: If a file is no evaluation of an actor; the message names the file.
@@ -96,7 +96,7 @@ def actors_table(actors: Path) -> str:
 
 
 def actors_summary(actors: Path) -> str:
-    """Return a short table of all evaluations `<task>.json` in a folder, with five columns.
+    """Return a Markdown table with only the success of each `<task>.json` in a folder.
 
     Raises:
         ValueError: If a file is no evaluation of an actor; the message names the file.

@@ -49,7 +49,7 @@ class Band:
 
 
 def write_study(study: Study, output: Path) -> None:
-    """Write the tables and the figure of a study from its runs; do nothing if it has no runs.
+    """Write tables and figure of a study into its folder `output`; do nothing if it has no runs.
 
     `arms.csv` holds medians and quartiles. `README.md` keeps what the user wrote around its table.
 
@@ -73,7 +73,7 @@ def write_study(study: Study, output: Path) -> None:
 
 
 def sum_up_arms(study: Study, runs: Sequence[Run]) -> list[dict[str, Any]]:
-    """Return the rows of `arms.csv`, grouped by task, in the order of the study's variants."""
+    """Return the rows of `arms.csv` with medians, quartiles and p-values by task and variant."""
     first = study.arms[0].name
     order = [arm.name for arm in study.arms]
     rows = []
@@ -105,10 +105,10 @@ def _grouped(runs: Sequence[Run], name: str) -> dict[str, list[Run]]:
 
 
 def _timed(run: Run, seconds: Mapping[str, float]) -> Run:
-    """Return a copy of a run with `area_in_time`: the mean success within the baseline's time.
+    """Return a copy of a run with `area_in_time`, its mean success in the baseline's CPU time.
 
     Args:
-        seconds: Median processor time of the baseline, s, by machine. If it lacks the machine of
+        seconds: Median CPU time of the baseline, s, by machine. If it lacks the machine of
             `run`, `area_in_time` is None.
     """
     known = seconds.get(run['machine'])
@@ -123,7 +123,7 @@ def _bands(runs: Sequence[Run]) -> dict[str, dict[str, Band]]:
 
 
 def aggregate(curves: Sequence[Curve]) -> Band:
-    """Return median and quartiles over the steps that all curves cover.
+    """Return median and quartiles of success at the steps that all curves cover.
 
     Resumed runs are evaluated at other steps, so values between evaluations are interpolated.
     """
@@ -137,7 +137,7 @@ def aggregate(curves: Sequence[Curve]) -> Band:
 
 
 def format_study(study: Study, arms: Sequence[Mapping[str, Any]]) -> str:
-    """Return the Markdown table of a study: a variant per row, quartiles beside each median."""
+    """Return a Markdown table with one line for each row in `arms`, a result of `sum_up_arms`."""
     labels = {arm.name: arm.label for arm in study.arms}
     lines = [
         f'| task | variant | seeds | area | steps to {GOOD_SUCCESS} (reached) | final success '
@@ -161,7 +161,7 @@ def format_study(study: Study, arms: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _times(row: Mapping[str, Any]) -> tuple[str, str, str]:
-    """Return the cells of processor time, mean success in equal time and samples per second."""
+    """Return the cells of CPU time, success in equal time and samples per second, or dashes."""
     if not row['timed']:
         return ('-',) * 3
     some = '' if row['timed'] == row['seeds'] else f', of {row["timed"]}'
@@ -222,7 +222,7 @@ def draw(bands: Bands, labels: Mapping[str, str]) -> bytes:
 
     Args:
         bands: Median and quartiles by task and variant.
-        labels: Label of each variant, the baseline first. The order determines the colours.
+        labels: Label of each variant by name, the baseline first. The order determines the colours.
     """
     from matplotlib.figure import Figure
     from matplotlib.ticker import EngFormatter
@@ -258,7 +258,7 @@ def draw(bands: Bands, labels: Mapping[str, str]) -> bytes:
 def _panels(
     task: str, arms: Mapping[str, Band], labels: Mapping[str, str]
 ) -> list[tuple[str, str, list[str]]]:
-    """Divide the variants of a task among panels; return task, title and variants of each."""
+    """Divide the variants of a task among panels; return each panel's task, title and variants."""
     names = [name for name in labels if name in arms]
     if len(names) <= _MOST_LINES:
         return [(task, task, names)]
@@ -280,7 +280,7 @@ def _add_legend(figure: Any, panels: Sequence[Any], columns: int) -> None:
 
 
 def _top_of_axis(bands: Bands) -> float:
-    """Return the upper limit of the success axis: 1, or less if all quartiles are at most .4."""
+    """Return the upper limit of the success axis: 1, or less if no upper quartile exceeds 0.4."""
     # Curves without a common step have an empty band.
     tops = [band.upper for arms in bands.values() for band in arms.values() if band.upper.size]
     highest = max((float(upper.max()) for upper in tops), default=0.0)

@@ -102,7 +102,7 @@ _IN_BFLOAT16 = 'HandReach', 'HandManipulateBlockRotateZ', 'HandManipulateEggRota
 
 
 def _paper_settings(task: str) -> dict[str, Any]:
-    """Return the settings of a task, for runs of about a quarter of an hour on one core.
+    """Return the settings of a task in the study `paper`, for runs of 15 minutes on one core.
 
     Fetch tasks have 1.2 % (FetchReach) or 32 % of the paper's steps and smaller batches. One
     collection of 76 episodes replaces two of 38, with twice the updates. Targets move every 10
@@ -129,7 +129,7 @@ def _paper_settings(task: str) -> dict[str, Any]:
 
 
 def _returns() -> Iterator[Arm]:
-    """Yield variants: returns of 1 step, and of 3, 5 or 10 with each off-policy `correction`."""
+    """Yield variants with returns of 1 step, and of 3, 5 or 10 steps for each `correction`."""
     yield _arm('one', 'one step', n_step=1)
     for steps, correction in product((3, 5, 10), ('none', 'lambda', 'cut')):
         label = f'{steps} steps, correction {correction}'
@@ -148,7 +148,7 @@ def _targets() -> Iterator[Arm]:
 
 
 def _ensembles() -> Iterator[Arm]:
-    """Yield variants with one critic, ensembles, quantiles or more updates."""
+    """Yield variants with one critic, several critics, critics of quantiles, and more updates."""
     yield _arm('one', 'one critic', critics=1)
     for number, pooling in ((2, 'mean'), (2, 'min'), (5, 'mean'), (5, 'min'), (5, 'truncated')):
         label = f'{number} critics, {pooling}'
@@ -165,7 +165,7 @@ def _ensembles() -> Iterator[Arm]:
 
 
 def _rates() -> Iterator[Arm]:
-    """Yield variants: the recipe at 250, 125 and 25 Hz, and changes that may help at 250 Hz."""
+    """Yield the recipe at 250, 125 and 25 Hz, and variants that may help at 250 Hz."""
     for rate in (250, 125, 25):
         label = f'{rate} Hz, as it is'
         yield _arm(f'plain{rate}', label, control_hz=float(rate), discount='tick')

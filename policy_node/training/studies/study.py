@@ -71,7 +71,7 @@ class Arm:
 
     @property
     def own(self) -> set[str]:
-        """Names of the fields that only this variant sets."""
+        """Names of the fields in `changes` and `factors`."""
         return {*self.changes, *self.factors}
 
 
@@ -80,7 +80,7 @@ class Start:
     """Trained networks from which the runs of a task start.
 
     Attributes:
-        task: The task whose run trains them, earlier in the study.
+        task: Task of the study whose run with the same variant and seed trains them.
         fields: Fields of `TrainConfig` for the runs that start from them.
     """
 
@@ -151,12 +151,12 @@ class Study:
         are scaled with the action frequency, so that all runs have equal simulated time.
 
         Args:
-            overrides: Fields of `TrainConfig` for all runs.
+            overrides: Fields of `TrainConfig` for all runs; `changes` of a variant replace them.
             output: Folder of all runs.
             episodes: Fresh episodes that measure the last actor of each run.
 
         Raises:
-            ValueError: If a task or a value is not allowed.
+            ValueError: If a task or value is not allowed, or `arms` lacks the `after` of a variant.
         """
         for task in tasks:
             if task not in self.settings:
@@ -208,7 +208,7 @@ class Job:
 
     @property
     def name(self) -> str:
-        """Task, variant and seed as in the path of the folder."""
+        """Path `<task>/<variant>/seed<seed>` of the folder, within the folder of all runs."""
         return f'{self.config.task}/{self.arm.name}/seed{self.config.seed}'
 
     @property
@@ -218,19 +218,19 @@ class Job:
 
     @property
     def is_trained(self) -> bool:
-        """True if the last training state has all environment steps; the log may be newer."""
+        """True if the training state in the folder has reached the configured number of steps."""
         if not self.has_checkpoint:
             return False
         return read_counters(self.folder / STATE_FILE).env_steps >= self.config.total_steps
 
     @property
     def is_ready(self) -> bool:
-        """True if the job can start: networks from another job are trained, or not needed."""
+        """True if the job can start: `after` is None or trained, or this job has begun."""
         return self.after is None or self.has_checkpoint or self.after.is_trained
 
     @property
     def status(self) -> str:
-        """The progress of the run in one line: steps, last success and remaining time."""
+        """One line with name, steps, success in the last evaluation and remaining time."""
         log, total = self.folder / PROGRESS_FILE, self.config.total_steps
         rows = read_progress(log) if log.is_file() else []
         evaluated = [row['eval_success'] for row in rows if 'eval_success' in row]
@@ -243,7 +243,7 @@ class Job:
     def check_configuration(self) -> None:
         """Raise ValueError if the folder contains a run with another configuration.
 
-        The message names the fields that differ. A damaged training state also raises ValueError.
+        Fields that do not change the result may differ. A damaged training state raises ValueError.
         """
         if not self.has_checkpoint:
             return
@@ -265,7 +265,7 @@ def to_settings(config: TrainConfig) -> dict[str, Any]:
 
 
 def differing_fields(stored: Mapping[str, Any], config: TrainConfig) -> dict[str, str]:
-    """Return the fields that differ and change the result, each with a text of both values.
+    """Return a text with both values for each field that differs and changes the result.
 
     Args:
         stored: A configuration from `to_settings`; missing fields have their default.

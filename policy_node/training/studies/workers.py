@@ -48,7 +48,7 @@ class Place(Protocol):
     """Largest number of jobs at once."""
 
     def start(self, job: Job) -> None:
-        """Start a job; it may have ended when this returns."""
+        """Start a job; this method may return before or after the job has ended."""
         ...
 
     def wait(self) -> tuple[Job, int]:
@@ -110,8 +110,9 @@ def _print(text: str) -> None:
 
 
 def attempt(job: Job, report: Path, command: str) -> int:
-    """Train or continue a job; store its measures and `command` in `report`; return a status.
+    """Train or continue a job; store its measures in the folder `report`; return a status.
 
+    `command` is the command line, which is stored with the measures.
     The status is 0, 1 (error), `TAKEN` (another process trains it) or 128 + number of a signal.
     """
     try:
@@ -161,8 +162,9 @@ class ThisProcess:
 class Processes:
     """Place that runs several jobs at once, each in a process that prints to its `log.txt`.
 
-    Ctrl-C and SIGTERM are passed on to the processes as SIGTERM. The processes then finish their
-    cycle and save their state, also if this process is killed. A second signal ends them at once.
+    As a context manager, it passes Ctrl-C and SIGTERM on to the processes as SIGTERM. They then
+    finish their training cycle and save their state, as they do if this process is killed. A second
+    signal ends them at once.
     """
 
     def __init__(self, limit: int, report: Path, command: str) -> None:
