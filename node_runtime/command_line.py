@@ -212,7 +212,7 @@ def _ignores_interrupt() -> bool:
 
 
 def make_output_usable() -> None:
-    """Replace a missing stdout or stderr by /dev/null; escape characters that others lack.
+    """Replace a missing stdout or stderr by /dev/null; escape characters it cannot encode.
 
     Does nothing in a program with its own SIGINT handler, which called the command as a function.
     """
@@ -271,7 +271,7 @@ def _require_rclpy() -> None:
 
 @contextmanager
 def progress(description: str, total: int) -> Iterator[Callable[[int], None]]:
-    """Show a progress bar up to `total` if stderr is a terminal; yield a function that adds to it."""
+    """Show a progress bar up to `total` if stderr is a terminal; yield a function to advance it."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
     from rich.progress import TimeRemainingColumn as Remaining

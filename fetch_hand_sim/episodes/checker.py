@@ -88,7 +88,7 @@ class CheckResult:
         path: The MCAP file.
         ticks: Number of identical ticks, up to the first difference.
         messages: Number of messages that the robot published in these ticks.
-        unchecked: Number of messages in a last tick without `applied_command`, which cannot be checked.
+        unchecked: Number of messages in a last tick without `applied_command`; not checked.
         difference: The first difference; None if the episode is identical.
         changed: Software versions that differ from the recorded ones: `name recorded -> here`.
     """

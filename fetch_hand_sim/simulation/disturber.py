@@ -136,7 +136,7 @@ class Disturber:
         return bool(self._physics.names)
 
     def start_nominal(self, ids: Ids) -> None:
-        """Undo variations of physics in simulations `ids`; call it before the task draws a start."""
+        """Undo variations of physics in simulations `ids`; call it before a start is drawn."""
         self._physics.restore(ids)
 
     def start(

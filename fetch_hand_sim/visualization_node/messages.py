@@ -183,7 +183,7 @@ class Camera:
 
     @property
     def is_due(self) -> bool:
-        """True if the caller should render now; False if the last picture is recent or `hz` is 0."""
+        """True if a picture is due; False if the last one is too recent or `hz` is 0."""
         return np.isfinite(self._period) and self._clock() >= self._due
 
     def render(self, scene: Scene, frame: Frame) -> Picture:

@@ -205,7 +205,7 @@ def _require_task(name: str, task: str | None) -> str:
 
 
 class _FunctionPolicy(MemorylessPolicy):
-    """A policy that calls a function from one observation to one action, once for each row of a batch."""
+    """A policy that calls a function from one observation to one action, also in a batch."""
 
     def __init__(self, function: Callable[[Observation], Any]) -> None:
         self._function = function

@@ -25,7 +25,7 @@ from msgs_spec.tasks import TaskSpec
 
 
 def load_hand_model(asset: str) -> mujoco.MjModel:
-    """Compile an MJCF asset such as `hand/reach.xml`, tuned for speed with the same trajectories."""
+    """Compile an MJCF asset such as `hand/reach.xml`, tuned for speed with equal trajectories."""
     mjcf = load_spec(asset)
     list_geom_pairs(mjcf)
     model = mjcf.compile()
@@ -78,7 +78,7 @@ class HandTask(Task):
         return self._ctrl.copy()
 
     def _fingertip_poses(self) -> Array:
-        """Return five fingertip poses, world, (N, 35); a pose is position, m, and quaternion, wxyz."""
+        """Return the fingertip poses in the world, (N, 35), five times position, m, and wxyz."""
         positions = self._site_xpos[:, self._fingertip_sites]
         quaternions = self._xquat[:, self._fingertip_bodies]
         return np.concatenate([positions, quaternions], axis=2).reshape(self.batch.nsim, -1)

@@ -148,7 +148,7 @@ class HandManipulateTask(HandTask):
         self.batch.forward(ids)
 
     def _sample_start(self, generator: np.random.Generator) -> Array:
-        """Draw the start pose (7,) of the object in the world, position, m, and quaternion, wxyz."""
+        """Draw the start pose (7,) of the object in the world: position, m, and quaternion wxyz."""
         position, quaternion = self._object_start[:3].copy(), self._object_start[3:]
         if self.config.randomizes_rotation:
             offset = self._sample_rotation(generator)

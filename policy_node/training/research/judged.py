@@ -79,7 +79,7 @@ class ChoosingSampler(TransitionSampler):
         return goal
 
     def _best(self, starts: Starts, first: Array32, generator: np.random.Generator) -> Array32:
-        """Return the goals with the highest scores among `first` and seven new future goals each."""
+        """Return the highest-scored goals among `first` and seven new future goals for each."""
         candidates, source = [first], np.zeros(len(first), np.intp)
         for _ in range(CANDIDATES - 1):
             candidates.append(goals_of(starts, source, ['future'], generator))
