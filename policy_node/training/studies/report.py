@@ -141,7 +141,7 @@ def format_study(study: Study, arms: Sequence[Mapping[str, Any]]) -> str:
     labels = {arm.name: arm.label for arm in study.arms}
     lines = [
         f'| task | variant | seeds | area | steps to {GOOD_SUCCESS} (reached) | final success '
-        '| processor time, s | area in equal time | samples per s | against the baseline |',
+        '| CPU time, s | area in equal time | samples per s | against the baseline |',
         '| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |',
     ]
     for row in arms:
