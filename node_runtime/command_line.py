@@ -212,7 +212,7 @@ def _ignores_interrupt() -> bool:
 
 
 def make_output_usable() -> None:
-    """Replace a missing stdout or stderr by /dev/null; escape characters it cannot encode.
+    """Replace a missing stdout or stderr by /dev/null; escape characters not in the encoding.
 
     Does nothing in a program with its own SIGINT handler, which called the command as a function.
     """

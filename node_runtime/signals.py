@@ -1,4 +1,4 @@
-"""Signals, closed pipes and interrupted imports: how every process of this project ends early.
+"""End a process of this project early: at a signal, a closed pipe or Ctrl-C during imports.
 
 `fetch_hand_sim` and `policy_node` call `guard_loading` first, so this module imports little.
 """

@@ -118,7 +118,7 @@ class EpisodeOutcome:
 
     @classmethod
     def parse(cls, result: Strings) -> EpisodeOutcome:
-        """Parse the contents of the record; missing and invalid numbers become None."""
+        """Parse the contents of the outcome record; missing and invalid numbers become None."""
         is_complete = _flag(result.get('complete', '')) is True
         return cls(
             is_complete=is_complete,

@@ -202,7 +202,7 @@ class MetadataRecord:
 
 @dataclass(frozen=True, slots=True)
 class AttachmentRecord:
-    """An attachment; `index` has the bytes that its index record in the summary must have."""
+    """An attachment; `index` is the content that its index record in the summary must have."""
 
     index: bytes
     name: str

@@ -129,9 +129,10 @@ def check_size(width: object, height: object) -> None:
 
 
 def make_camera(scene: Scene, name: str | Mapping[str, Any] | None) -> mujoco.MjvCamera:
-    """Return the camera called `name`, or the scene's view changed by the attributes `name`.
+    """Return the camera called `name`; None gives the default view of the scene.
 
-    None leaves the view unchanged. Unknown names and invalid values raise ValueError.
+    A mapping gives the default view with these attributes of `MjvCamera` set. Unknown names and
+    invalid values raise ValueError.
     """
     camera = mujoco.MjvCamera()
     if name is None or isinstance(name, Mapping):

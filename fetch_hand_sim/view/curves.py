@@ -84,7 +84,7 @@ class Curves:
 
 
 class History:
-    """Stores the newest tick of a robot with its trail (`picture`) and past ticks (`curves`)."""
+    """Stores a robot's newest tick with its trail (`picture`), and its past ticks (`curves`)."""
 
     def __init__(self, spec: TaskSpec, metric: GoalMetric) -> None:
         self.spec = spec

@@ -299,8 +299,8 @@ class PolicyNode(Node):
     def _may_follow(self, status: EpisodeStatus) -> bool:
         """Return whether to follow the robot that published `status`.
 
-        True for the first robot, the present one, the only one on the topic (it replaced the
-        present one), and for a second robot if a policy of its task and frequency is found.
+        True for the first robot, for the present one, and for the only one on the topic, which has
+        replaced the present one. A second robot needs a policy of its task and frequency.
         """
         known = self._status
         if known is None or status.is_of_same_robot(known):

@@ -1,4 +1,4 @@
-"""Network inputs made from observation and goal, for differences to the goal and symmetry.
+"""Compute network inputs with the difference to the goal and the symmetry of the object.
 
 The inputs are functions of observation and goal alone and add no information. They spare the
 network from learning quaternion products and symmetries. The same functions serve NumPy arrays

@@ -113,8 +113,8 @@ class HandManipulateTask(HandTask):
     def reset(self, ids: Ids, generators: Generators) -> Array:
         """Drop the object on the palm until it stays there; return drawn goals (len(ids), 7).
 
-        If an attempt diverges or the object falls, the next one keeps its controls and warm start,
-        as in Gymnasium-Robotics. After 1000 attempts, raise RuntimeError.
+        If an attempt diverges or the object falls, the next attempt keeps the controls and warm
+        start of the failed one, as in Gymnasium-Robotics. RuntimeError after 1000 attempts.
         """
         self.batch.state[ids] = self.start_state
         generator_of = dict(zip(ids.tolist(), generators, strict=True))

@@ -176,7 +176,7 @@ class Task(ABC):
 
     @property
     def asset(self) -> str:
-        """The MJCF asset that the model was compiled from."""
+        """Path, inside the assets, of the MJCF file that the model was compiled from."""
         return self.ASSET
 
     @abstractmethod

@@ -82,11 +82,11 @@ class Proposer:
 
 
 class GuidedPolicy:
-    """Actor and high level as one policy without noise, which counts the ticks of episodes.
+    """Policy of both levels without noise: the actor acts towards subgoals of the high level.
 
     Args:
         every: Number of ticks for which a subgoal holds.
-        ticks: Number of ticks of an episode; then the next call of `predict` begins a new one.
+        ticks: Number of ticks of an episode; after as many calls, `predict` begins a new one.
     """
 
     def __init__(self, actor: Policy, proposer: Proposer, every: int, ticks: int) -> None:

@@ -161,7 +161,7 @@ def format_study(study: Study, arms: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _times(row: Mapping[str, Any]) -> tuple[str, str, str]:
-    """Return the cells of CPU time, success in equal time and samples per second, or dashes."""
+    """Return cells of CPU time, area in equal time and samples per second; dashes if not timed."""
     if not row['timed']:
         return ('-',) * 3
     some = '' if row['timed'] == row['seeds'] else f', of {row["timed"]}'

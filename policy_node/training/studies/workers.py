@@ -160,7 +160,7 @@ class ThisProcess:
 
 
 class Processes:
-    """Place that runs several jobs at once, each in a process that prints to its `log.txt`.
+    """Runs several jobs at once on this machine, each in a process that prints to its `log.txt`.
 
     As a context manager, it passes Ctrl-C and SIGTERM on to the processes as SIGTERM. They then
     finish their training cycle and save their state, as they do if this process is killed. A second

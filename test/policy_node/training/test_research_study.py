@@ -237,7 +237,7 @@ def test_a_study_is_run_measured_extended_and_measured_again(
 
 
 def store(folder: Path, jobs: list[Job], machine: str = 'A', seconds: float = 10.0) -> None:
-    """Store a run of each job; its processor time depends on its seed."""
+    """Store a run of each job; its CPU time depends on its seed."""
     for job in jobs:
         task, arm, seed = job.key
         run = {
