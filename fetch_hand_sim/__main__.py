@@ -124,7 +124,7 @@ def ros_arguments(words: Sequence[str]) -> list[str]:
     """Expand short ROS parameters: `task:=FetchPush` becomes `--ros-args -p task:=FetchPush`.
 
     Words that begin with `__`, such as `__ns:=/left`, become remappings (`-r`). Other ROS arguments
-    may follow, with or without `--ros-args`. Without `:=` in each earlier word, nothing changes.
+    may follow, with or without `--ros-args`. If a word before them lacks `:=`, nothing changes.
     """
     short = list(itertools.takewhile(lambda word: not word.startswith('-'), words))
     rest = list(words[len(short) :])

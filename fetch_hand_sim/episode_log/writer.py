@@ -54,7 +54,7 @@ class ReceivedAllowance:
 
         `has_room=False` means that the file is full: the message is not logged. Messages that the
         robot rejected (`is_refused`) may use at most half of each limit, so that room remains for
-        valid messages. `omitted` lists rejected messages as `<topic> (refused)`.
+        valid messages. `omitted` lists those not logged as `<topic> (refused)`.
         """
         share = 2 if is_refused else 1
         if (

@@ -47,7 +47,7 @@ def load_recording(path: Path) -> Recording:
 
 
 def recording_of(arrays: EpisodeArrays) -> Recording:
-    """Return a loaded episode as frames; read joint and object positions from its file again."""
+    """Return a loaded episode as frames; joint and object positions come from its file."""
     task, stamps = arrays.record.task, arrays.stamps
     file, poses = read_episode(arrays.path), None
     with one_line_errors(file.path):

@@ -143,7 +143,7 @@ def _conditioned(
 
 
 class ConditionedDDPG(DDPG):
-    """`DDPG` with a condition, success threshold or steps left, as input of actor and critic."""
+    """`DDPG` with one more input of actor and critic: success threshold or number of steps left."""
 
     def _make_networks(self, shape: NetworkShape) -> tuple[Actor, nn.Module]:
         actor, inputs = Actor(shape), shape.feature_size + 1

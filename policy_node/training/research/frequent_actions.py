@@ -118,7 +118,7 @@ class PerturbedActors(MemorylessPolicy):
         self._actors = actors
 
     def act(self, observation: Observations) -> Array32:
-        """Return actions (N, action size); the first rows of `observation` go to the first actor."""
+        """Return actions (N, action size); the first rows of observations go to the first actor."""
         values = {name: np.asarray(rows) for name, rows in observation.items()}
         parts = np.array_split(np.arange(len(values['observation'])), len(self._actors))
         answers = [

@@ -88,7 +88,7 @@ class RunFolder:
     _last_replay: float = field(default_factory=time.monotonic)
 
     def replay_file(self) -> Path:
-        """Return the path of the file with the newest episodes of this worker."""
+        """Return the path at which this worker saves its newest episodes, to resume from."""
         rank = self.workers.rank
         return self.path / (REPLAY_FILE if rank == 0 else f'{rank}.{REPLAY_FILE}')
 
