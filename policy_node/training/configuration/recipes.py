@@ -142,6 +142,7 @@ _SLIDE = _FETCH | {
     'total_steps': 4_500_000,
     'target_update_interval': 10,
     'replay_transitions': 6_000_000,
+    'evaluate_every': 150_000,
     'evaluation_episodes': 400,
 }
 # A sparse reward without grades never finds the goals of the ring finger, whose poses lie at the
@@ -173,7 +174,6 @@ _SLIDE_FINETUNE = _SLIDE | {
     'final_exploration': 0.25,
     'updates_per_cycle': 160,
     'total_steps': 1_200_000,
-    'evaluate_every': 150_000,
 }
 # For an egg that mostly holds reached goals: smaller steps and graded rewards.
 _EGG_FINETUNE = {
