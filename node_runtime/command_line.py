@@ -199,16 +199,17 @@ def _unclaimed_signals() -> list[signal.Signals]:
     Returns [] if the program has its own handler of SIGINT. If SIGINT is ignored, as in background
     processes of shells, the other two are still returned.
     """
-    if not (has_default_interrupt() or _ignores_interrupt()):
+    if _handles_interrupt():
         return []
     others = (signal.SIGTERM, signal.SIGHUP)
     found = [each for each in others if signal.getsignal(each) == signal.SIG_DFL]
-    return found if _ignores_interrupt() else [signal.SIGINT, *found]
+    return [signal.SIGINT, *found] if has_default_interrupt() else found
 
 
-def _ignores_interrupt() -> bool:
-    """Return whether SIGINT is ignored, as in the background processes of a shell script."""
-    return signal.getsignal(signal.SIGINT) == signal.SIG_IGN
+def _handles_interrupt() -> bool:
+    """Return whether the program has its own handler of SIGINT."""
+    is_ignored = signal.getsignal(signal.SIGINT) == signal.SIG_IGN
+    return not (is_ignored or has_default_interrupt())
 
 
 def make_output_usable() -> None:
@@ -216,7 +217,7 @@ def make_output_usable() -> None:
 
     Does nothing in a program with its own SIGINT handler, which called the command as a function.
     """
-    if not (has_default_interrupt() or _ignores_interrupt()):
+    if _handles_interrupt():
         return
     for name in ('stdout', 'stderr'):
         stream = getattr(sys, name)

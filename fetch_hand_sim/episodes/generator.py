@@ -41,8 +41,8 @@ _COMPLETING_THREADS = 4
 class _Robot:
     """One robot of the batch in one episode.
 
-    `messages` contains stamp (ns), published messages and received command of each tick. The
-    command is None until it is received.
+    `messages` contains stamp (ns), published messages and received command of each tick. Before a
+    command is received, None replaces it.
     """
 
     episode: RobotEpisode

@@ -178,7 +178,7 @@ class Health:
         return f'{tick} waits for a valid command; {self._command_source()}{last}'
 
     def _command_source(self) -> str:
-        """Return the end of a log line: which commanders send nothing, or that there are none."""
+        """Return the end of a log line: names of silent commanders, or that no node commands."""
         if names := self._watch.inputs.commanders:
             return f'{", ".join(names)} {"sends" if len(names) == 1 else "send"} none'
         return '; '.join(['no node publishes any', *self._watch.waiting_elsewhere()])

@@ -79,7 +79,7 @@ def _specification(spec: TaskSpec) -> Rules:
 
 
 def _model(task: Task) -> Rules:
-    """Yield pairs (is met, error) about the model.
+    """Yield pairs (`is_met`, error) about the model.
 
     The object, if any, needs a free joint. Body, type, position and size of all simulated geoms
     must equal those in the MJCF file of the task.
@@ -113,7 +113,7 @@ def _sensors(task: Task) -> Rules:
 
 
 def _formulas(task: Task) -> Rules:
-    """Yield pairs (is met, error) about `observe_from`, the formulas of observation and goal.
+    """Yield pairs (`is_met`, error) about `observe_from`, the formulas of observation and goal.
 
     The formulas must accept readings with any leading axes, and compute each row independently.
     """
@@ -154,7 +154,7 @@ def _rewards(simulation: Simulation) -> Rules:
 
 
 def _resets(simulation: Simulation) -> Rules:
-    """Yield (is met, error): equal seeds give equal starts; a reset changes only its `ids`."""
+    """Yield pairs (`is_met`, error): equal seeds repeat starts; a reset changes only `ids`."""
     size = simulation.spec.robot.action_size
     simulation.reset(seed=[0, 1])
     first = _all_sensors(simulation)

@@ -189,8 +189,8 @@ class PolicyNode(Node):
     def _load_for_one(self, name: str) -> tuple[LoadedPolicy | None, EpisodeStatus | None]:
         """Load the policy `name`; return the policy and the last status of a robot that it fits.
 
-        The status is None if no robot runs. The policy is None if it needs the task of a robot,
-        which is unknown then.
+        Without a robot, the status is None. The policy is None, too, if loading it needs the task
+        of a robot.
 
         Raises:
             ValueError: If the policy cannot be loaded, or fits no robot.

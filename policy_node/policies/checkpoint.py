@@ -136,7 +136,7 @@ def to_metadata(info: ActorInfo) -> dict[str, str]:
 
 
 def read(path: str | Path, task: str | None = None) -> Checkpoint:
-    """Read a checkpoint, of any task if `task` is None.
+    """Read a checkpoint of the task `task`; with None, of any task.
 
     Raises:
         ValueError: If the file is missing, invalid, of an unknown version, or not of `task`. The

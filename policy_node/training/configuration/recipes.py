@@ -163,30 +163,29 @@ _HAND_REACH = {
     'total_steps': 2_000_000,
     'replay_transitions': 2_000_000,
 }
-# A smaller learning rate, less noise and more updates after `_SLIDE`.
-_SLIDE_FINETUNE = _SLIDE | {
-    'learning_starts': 150_000,
-    'critic_first': 2_000,
-    'learning_rate': 3e-4,
-    'final_learning_rate': 0.05,
-    'noise_std': 0.06,
-    'random_epsilon': 0.06,
-    'final_exploration': 0.25,
-    'updates_per_cycle': 160,
-    'total_steps': 1_200_000,
-}
-# For an egg that mostly holds reached goals: smaller steps and graded rewards.
-_EGG_FINETUNE = {
-    'learning_starts': 64_000,
-    'critic_first': 2_000,
-    'learning_rate': 3e-4,
-    'noise_std': 0.1,
-    'random_epsilon': 0.08,
-    'reward_grades': '.5,1,2',
-    'policy_delay': 2,
-    'actor_average': 0.97,
-    'total_steps': 1_200_000,
-    'evaluation_episodes': 400,
+# A smaller learning rate and less noise after `best`, by task.
+_CAREFUL = {'critic_first': 2_000, 'learning_rate': 3e-4, 'total_steps': 1_200_000}
+_FINETUNE: dict[str, dict[str, Any]] = {
+    'FetchSlide': _CAREFUL
+    | {
+        'learning_starts': 150_000,
+        'final_learning_rate': 0.05,
+        'noise_std': 0.06,
+        'random_epsilon': 0.06,
+        'final_exploration': 0.25,
+        'updates_per_cycle': 160,
+    },
+    # As in the run that took the egg from .940 to .977 (docs/lab_notes/training_log.md).
+    'HandManipulateEggRotate': _CAREFUL
+    | {
+        'learning_starts': 64_000,
+        'noise_std': 0.1,
+        'random_epsilon': 0.08,
+        'reward_grades': '.5,1,2',
+        'policy_delay': 2,
+        'actor_average': 0.97,
+        'evaluation_episodes': 400,
+    },
 }
 _BEST: dict[str, dict[str, Any]] = {
     'FetchReach': _REACH,
@@ -270,10 +269,8 @@ def _finetune(task: str) -> dict[str, Any]:
     Raises:
         ValueError: If the task is neither FetchSlide nor has an object in the hand.
     """
-    if task == 'FetchSlide':
-        return _SLIDE_FINETUNE | {'init_from': task}
-    if task == 'HandManipulateEggRotate':
-        return _best(task) | _EGG_FINETUNE | {'init_from': task}
+    if task in _FINETUNE:
+        return _best(task) | _FINETUNE[task] | {'init_from': task}
     if not task.startswith('HandManipulate'):
         allowed = 'FetchSlide and the tasks with an object in the hand'
         raise ValueError(f'recipe finetune for {task}; allowed: {allowed}')
