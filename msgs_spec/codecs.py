@@ -335,8 +335,8 @@ class TopicCodec:
     def decode_many(self, messages: NDArray[np.uint8]) -> tuple[NDArray[np.int64], Array]:
         """Decode n messages (n, size) at once; return stamps (n,) and vectors (n, topic.size).
 
-        Raise LayoutError if the bytes of any message are arranged differently from `encode`. In
-        this case, decode all messages one by one with `decode`.
+        Raise LayoutError if `encode` could not have returned one of the messages. In this case,
+        decode all messages one by one with `decode`.
         """
         if messages.ndim != 2 or messages.shape[1] != self.size:
             raise LayoutError(f'{self.topic.name}: {messages.shape[-1]} bytes, not {self.size}')
@@ -346,7 +346,9 @@ class TopicCodec:
         if self._has_stamp:
             parts = messages[:, _BODY : _BODY + _STAMP.size].copy()
             seconds, nanoseconds = parts.view('<i4')[:, 0], parts.view('<u4')[:, 1]
-            stamps = seconds.astype(np.int64) * 10**9 + nanoseconds
+            if (nanoseconds >= _NANOSECONDS).any():
+                raise LayoutError(f'{self.topic.name}: a stamp has too many nanoseconds')
+            stamps = seconds.astype(np.int64) * _NANOSECONDS + nanoseconds
         if self._is_bool:
             return stamps, (messages[:, _BODY : _BODY + 1] != 0).astype(np.float64)
         floats = messages[:, _BODY : _BODY + _FLOAT.size * self._floats].copy().view('<f8')

@@ -25,12 +25,12 @@ from msgs_spec.text import one_line
 from policy_node.policies.files import read_file, sha256
 from policy_node.policies.policy import LoadedPolicy, Observation
 
-# Algorithm by package of the policy class.
+# Algorithms by package of the policy class. PPO and A2C have the same one.
 _ALGORITHMS = {
-    'stable_baselines3.sac': 'SAC',
-    'stable_baselines3.td3': 'TD3',
-    'stable_baselines3.common': 'PPO',
-    'sb3_contrib.tqc': 'TQC',
+    'stable_baselines3.sac': ('SAC',),
+    'stable_baselines3.td3': ('TD3',),
+    'stable_baselines3.common': ('PPO', 'A2C'),
+    'sb3_contrib.tqc': ('TQC',),
 }
 # A stored replay buffer could require an environment or its full memory.
 _WITHOUT_TRAINING: dict[str, Any] = {
@@ -139,20 +139,18 @@ def _algorithm(data: bytes, path: Path) -> Any:
         # Each compression method raises its own types for a damaged file.
         line = one_line(error)
         raise ValueError(f'{path} is not a file of Stable-Baselines3: {line}') from None
-    for package, name in _ALGORITHMS.items():
+    for package, names in _ALGORITHMS.items():
         if str(module).startswith(f'{package}.'):
             library = package.partition('.')[0]
-            if name == 'PPO' and 'clip_range' not in settings:
-                # PPO and A2C have the same policy class.
-                name = 'A2C'
+            # Only PPO has a clip range.
+            name = names[0] if 'clip_range' in settings else names[-1]
             try:
                 return getattr(import_module(library), name)
             except ImportError:
                 missing = library.replace('_', '-')
                 raise ValueError(f'{path.name} needs {missing}: pip install {missing}') from None
-    raise ValueError(
-        f'{path} has a policy of {one_line(module)}; allowed: {", ".join(_ALGORITHMS.values())}'
-    )
+    allowed = ', '.join(name for names in _ALGORITHMS.values() for name in names)
+    raise ValueError(f'{path} has a policy of {one_line(module)}; allowed: {allowed}')
 
 
 def _check_sizes(path: Path, spec: TaskSpec, policy: Any) -> None:

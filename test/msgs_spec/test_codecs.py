@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from importlib import import_module
 
 import numpy as np
@@ -177,6 +178,17 @@ def test_other_layouts_are_read_one_by_one_and_refused_in_bulk():
     assert (stamp, found.tolist()) == (-5, vector.tolist())
     with pytest.raises(LayoutError, match='joint_states'):
         TopicCodec(spec).decode_many(rows(data))
+
+
+def test_too_many_nanoseconds_are_refused_alone_and_in_bulk():
+    codec = TopicCodec(topic(TASKS['FetchReach'], 'joint_states'))
+    data = codec.encode(7, np.zeros(codec.topic.size))
+    at = data.index(struct.pack('<iI', 0, 7)) + 4
+    wrong = data[:at] + struct.pack('<I', 10**9) + data[at + 4 :]
+    with pytest.raises(ValueError, match='nanosec 1000000000'):
+        codec.decode(wrong)
+    with pytest.raises(LayoutError, match='nanoseconds'):
+        codec.decode_many(rows(data, wrong))
 
 
 @pytest.mark.parametrize('name', ['joint_states', 'desired_goal', 'commands', 'is_success'])

@@ -101,7 +101,7 @@ class Study:
         arms: The variants; the first is the baseline.
         seeds: Default number of seeds.
         starts: Networks that the runs of a task start from, by task. If the task that trains them
-            is not selected, the networks are random.
+            is not selected, they are those of its shipped policy.
         ships: Whether the study selects actors to ship, instead of comparing variants. The best
             actor of each run is evaluated, and copied if it beats the shipped one.
     """
@@ -169,9 +169,9 @@ class Study:
                 before = jobs.get((start.task, arm.after or arm.name, seed)) if start else None
                 if arm.after and before is None:
                     raise ValueError(f'--arms {arm.name} also needs {arm.after}, where it starts')
-                given = (
-                    {**start.fields, 'init_from': str(before.folder)} if start and before else {}
-                )
+                # Networks of a task that is not selected are the shipped ones, found by its name.
+                networks = str(before.folder) if before else start.task if start else ''
+                given = {**start.fields, 'init_from': networks} if start else {}
                 values = {'recipe': 'best', **REPEATABLE, **self.settings[task], **given}
                 values |= {**overrides, **arm.changes, 'seed': seed}
                 rate = values.get('control_hz', DEFAULT_CONTROL_HZ)

@@ -245,3 +245,5 @@ def test_another_or_damaged_zip_is_refused_with_any_compression(tmp_path):
     for content in contents:
         path.write_bytes(content)
         assert_refused(path, r'model.zip')
+    zip_of(path, data=json.dumps({'policy_class': {'__module__': 'other.policies'}}))
+    assert_refused(path, 'other.policies; allowed: SAC, TD3, PPO, A2C, TQC')
