@@ -248,5 +248,4 @@ def past_before(
 
 def past_after(past: NDArray[np.float32], action: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return `past` with `action` (..., action size) inserted first and the oldest one dropped."""
-    kept = past[..., : past.shape[-1] - action.shape[-1]]
-    return np.concatenate([action, kept], axis=-1).astype(np.float32)
+    return np.concatenate([action, past], axis=-1)[..., : past.shape[-1]].astype(np.float32)

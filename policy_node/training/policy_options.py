@@ -43,7 +43,8 @@ def add_simulation_options(parser: argparse.ArgumentParser, num_envs: int) -> No
     add = parser.add_argument
     presets = 'none, mild, hardware, severe, scaled as in hardware*0.5, or a YAML file'
     add('--disturbances', default='none', help=f'of the robot: {presets}; default: none')
-    add('--success-rule', choices=SUCCESS_RULES, default='gymnasium', help='of the reward')
+    rule = 'of rewards and `touched`'
+    add('--success-rule', choices=SUCCESS_RULES, default='gymnasium', help=rule)
     add('--reward-type', choices=REWARD_TYPES, default='sparse', help='of the return')
 
 

@@ -159,8 +159,8 @@ def parse_assignment(text: str) -> tuple[str, Any]:
     """
     name, separator, value = text.partition('=')
     if name not in FIELDS:
-        near = did_you_mean(name, list(FIELDS))
-        raise ValueError(f'{text!r} is not name=value{near}; names: {", ".join(FIELDS)}')
+        near = did_you_mean(name, list(FIELDS)) or f'; allowed: {", ".join(FIELDS)}'
+        raise ValueError(f'{name[:80]!r} is no field of TrainConfig{near}')
     if not separator:
         raise ValueError(f'{text!r} is not name=value: give {name}=...')
     return name, parse_value(name, value)

@@ -5,8 +5,9 @@
 data, figure and table in docs/research/NAME. Runs that the folder contains are not trained again.
 
 `--study best`: the best recipe of every task, one job per core. Some tasks start from the networks
-of another, and FetchSlide is then fine-tuned (recipe `finetune`). Finally evaluates each best actor
-on fresh episodes and copies it with its critic, evaluation and curve into <output>/actors.
+of another: of a run if `--tasks` contains that task, else of its shipped policy. Some are then
+fine-tuned (variant `finetuned`, recipe `finetune`). Finally evaluates each best actor on fresh
+episodes and copies it with its critic, evaluation and curve into <output>/actors.
 
 `--study module:NAME`: a `Study` of your own in a Python module of the working directory.
 
@@ -124,6 +125,8 @@ def find_study(name: str) -> Study:
         line = f'{name} is called {study.name!r}; allowed: a word that no other study is'
     elif not study.settings or not study.arms:
         line = f'{name} has no settings of a task, or no arms'
+    elif len({arm.name for arm in study.arms if arm.name.isidentifier()}) < len(study.arms):
+        line = f'{name} has arms {[arm.name for arm in study.arms]}; allowed: different words'
     else:
         return study
     raise argparse.ArgumentTypeError(line)
@@ -220,6 +223,9 @@ def _not_stored(jobs: Sequence[Job], folder: Path) -> list[Job]:
     """Return the jobs whose runs are not in the report `folder`; print how many runs are in it."""
     runs = read_runs(folder)
     missing = [job for job in jobs if not holds(runs, job)]
+    # Their initial networks may be those of another machine.
+    needed = {job.after.key for job in missing if job.after and not job.after.is_trained}
+    missing = [job for job in jobs if job in missing or job.key in needed]
     if len(missing) < len(jobs):
         count = f'{len(jobs) - len(missing)} of {len(jobs)}'
         print(f'{count} runs are in {folder}; other --report and --output train them again')

@@ -147,8 +147,10 @@ class Study:
     ) -> list[Job]:
         """Return the jobs, sorted by task, then seed, then variant.
 
-        So a study that is stopped early has about equally many runs of each variant. Step counts
-        are scaled with the action frequency, so that all runs have equal simulated time.
+        So a study that is stopped early has about equally many runs of each variant. A job that
+        trains the initial networks of another comes before it, also if its variant is not in
+        `arms`. Step counts are scaled with the action frequency, so that all runs have equal
+        simulated time.
 
         Args:
             overrides: Fields of `TrainConfig` for all runs; `changes` of a variant replace them.
@@ -156,30 +158,40 @@ class Study:
             episodes: Fresh episodes that measure the last actor of each run.
 
         Raises:
-            ValueError: If a task or value is not allowed, or `arms` lacks the `after` of a variant.
+            ValueError: If a task or value is not allowed, or if no variant is for these tasks.
         """
         for task in tasks:
             if task not in self.settings:
                 raise ValueError(f'--tasks {task}; allowed in {self.name}: {", ".join(self.tasks)}')
         jobs: dict[tuple[str, str, int], Job] = {}
+
+        def add(task: str, arm: Arm, seed: int) -> Job:
+            key = task, arm.name, seed
+            if key in jobs:
+                return jobs[key]
+            before, given = None, {}
+            if start := Start(task, {}) if arm.after else self.starts.get(task):
+                if start.task in tasks:
+                    before = add(start.task, self.arm(arm.after) if arm.after else arm, seed)
+                # The name of a task stands for its shipped policy.
+                given = {**start.fields, 'init_from': str(before.folder) if before else start.task}
+            values = {'recipe': 'best', **REPEATABLE, **self.settings[task], **given}
+            values |= {**overrides, **arm.changes, 'seed': seed}
+            rate = values.get('control_hz', DEFAULT_CONTROL_HZ)
+            config = recipe_config(task, **{**values, **steps_at_rate(values, rate)})
+            factors = {name: to_flat(config)[name] * by for name, by in arm.factors.items()}
+            folder = output / task / arm.name / f'seed{seed}'
+            jobs[key] = Job(arm, changed(config, **factors), folder, before, episodes)
+            return jobs[key]
+
         for task in (name for name in self.tasks if name in tasks):
             of_task = [arm for arm in arms if not arm.tasks or task in arm.tasks]
             for seed, arm in product(seeds, of_task):
-                start = Start(task, {}) if arm.after else self.starts.get(task)
-                before = jobs.get((start.task, arm.after or arm.name, seed)) if start else None
-                if arm.after and before is None:
-                    raise ValueError(f'--arms {arm.name} also needs {arm.after}, where it starts')
-                # Networks of a task that is not selected are the shipped ones, found by its name.
-                networks = str(before.folder) if before else start.task if start else ''
-                given = {**start.fields, 'init_from': networks} if start else {}
-                values = {'recipe': 'best', **REPEATABLE, **self.settings[task], **given}
-                values |= {**overrides, **arm.changes, 'seed': seed}
-                rate = values.get('control_hz', DEFAULT_CONTROL_HZ)
-                config = recipe_config(task, **{**values, **steps_at_rate(values, rate)})
-                factors = {name: to_flat(config)[name] * by for name, by in arm.factors.items()}
-                folder = output / task / arm.name / f'seed{seed}'
-                job = Job(arm, changed(config, **factors), folder, before, episodes)
-                jobs[job.key] = job
+                add(task, arm, seed)
+        if not jobs:
+            allowed = ', '.join(dict.fromkeys(task for arm in arms for task in arm.tasks))
+            names = ', '.join(arm.name for arm in arms)
+            raise ValueError(f'--tasks {", ".join(tasks)}; allowed with --arms {names}: {allowed}')
         return list(jobs.values())
 
 

@@ -88,6 +88,7 @@ def test_past_actions_begin_as_zeros_and_the_newest_comes_first() -> None:
     for number in (1.0, 2.0, 3.0):
         past = past_after(past, np.full((1, 2), number, np.float32))
     assert past.tolist() == [[3.0, 3.0, 2.0, 2.0]]
+    assert past_after(past[:, :0], np.ones((1, 2), np.float32)).shape == (1, 0)
     state = np.ones((2, 4), np.float32)
     assert past_before(state, [True, False], (2,), 4).tolist() == [[0.0] * 4, [1.0] * 4]
     with pytest.raises(ValueError, match=r'\(2, 4\).*\(3, 4\)'):

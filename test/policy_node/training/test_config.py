@@ -108,7 +108,7 @@ def test_scalars_of_numpy_are_values_of_python():
     ('text', 'match'),
     [
         ('gamma', "'gamma' is not name=value: give gamma="),
-        ('zzz=1', 'is not name=value; names: task, '),
+        ('zzz=1', "'zzz' is no field of TrainConfig; allowed: task, "),
         ('layer_norm=maybe', "layer_norm 'maybe' is not of type bool"),
         ('num_envs=1.5', "num_envs '1.5' is not of type int"),
         ('hidden_sizes=wide', "hidden_sizes 'wide' is not numbers with commas"),

@@ -38,7 +38,7 @@ from policy_node.training.studies.store import (
     read_runs,
     require_alike,
 )
-from policy_node.training.studies.study import Job, Study, to_settings
+from policy_node.training.studies.study import Arm, Job, Start, Study, to_settings
 from support import ROOT
 from support.full_disk import files_at_most
 from support.runs import one_line, options_of
@@ -325,6 +325,29 @@ def test_a_full_disk_leaves_stored_runs_and_page_as_they_were(
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
+def test_a_study_whose_runs_start_from_one_another_can_be_continued(tmp_path: Path) -> None:
+    study = Study(
+        'chained',
+        None,
+        'Do first stages help?',
+        {'FetchPickAndPlace': {}, 'FetchPush': {}},
+        (Arm('long', 'one stage'), Arm('staged', 'two stages', after='long')),
+        starts={'FetchPickAndPlace': Start('FetchPush', {'noise_std': 0.1})},
+    )
+
+    def jobs_of_tasks(*tasks: str, seeds: tuple[int, ...] = (0,)) -> list[Job]:
+        return study.jobs(tasks, study.arms, seeds, {}, tmp_path / 'runs')
+
+    jobs = jobs_of_tasks(*study.tasks)
+    push, pick, staged_pick, staged_push = jobs
+    assert push.config.init_from == '' and pick.after is push
+    assert staged_pick.after is pick and staged_push.after is push
+    store(tmp_path, jobs)
+    require_alike(study, jobs_of_tasks(*study.tasks, seeds=(0, 1)), tmp_path)
+    with pytest.raises(ValueError, match=r"init_from '.*FetchPush.*', now 'FetchPush'"):
+        require_alike(study, jobs_of_tasks('FetchPickAndPlace'), tmp_path)
+
+
 PAGE = ROOT / 'docs' / 'research' / 'studies.md'
 FEW = ['--seeds', '0', '--steps', '800', '--episodes', '2']
 FEW += options_of(num_envs=8, evaluation_episodes=4, evaluate_every=400)
@@ -337,6 +360,7 @@ def module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     name = f'studies_of_{tmp_path.name}'.replace('-', '_')
     (tmp_path / f'{name}.py').write_text(
         f'{example}\nFAILS = 3\n'
+        "TWICE = Study('twice', None, '?', WIDTHS.settings, (Arm('a', 'a'),) * 2)\n"
         + example.replace('WIDTHS', 'TAKEN').replace("'widths'", "'values'")
     )
     monkeypatch.chdir(tmp_path)
@@ -363,6 +387,7 @@ def test_columns_of_the_tables_are_explained() -> None:
     [
         ('{}:FAILS', ':FAILS is a int; allowed: a Study'),
         ('{}:TAKEN', "is called 'values'; allowed: a word that no other study is"),
+        ('{}:TWICE', "has arms ['a', 'a']; allowed: different words"),
         ('{}:OTHER', ":OTHER: AttributeError: module '"),
         ('nowhere_at_all:STUDY', "ModuleNotFoundError: No module named 'nowhere_at_all'"),
         ('gaols', "module:NAME; did you mean 'goals'?"),
