@@ -72,7 +72,8 @@ class ImitationTrainer(BaseTrainer):
         init_from: The networks to imitate, from which the imitating actor starts too.
 
     Raises:
-        ValueError: With several workers, or if `value_weight` is set and `init_from` has no critic.
+        ValueError: With several workers, if `init_from` has another rate, or if `value_weight` is
+            set and `init_from` has no critic.
     """
 
     def __init__(
@@ -86,6 +87,11 @@ class ImitationTrainer(BaseTrainer):
     ) -> None:
         if workers.world_size > 1:
             raise ValueError(f'{workers.world_size} workers; algorithm imitation needs 1')
+        if init_from.control_hz != config.control_hz:
+            raise ValueError(
+                f'{init_from.origin["name"]} was trained at {init_from.control_hz:g} Hz, this run '
+                f'has {config.control_hz:g} Hz; algorithm imitation needs equal rates'
+            )
         super().__init__(config, output, workers, command, source_revision, init_from.origin)
         self._simulations = [
             self._simulate(_scaled(config, scale), config.num_envs)

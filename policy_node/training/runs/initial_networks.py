@@ -50,6 +50,7 @@ class InitialNetworks:
         tensors: Weights and normalizer statistics, by their names in the file `STATE_FILE`.
         shape: Sizes and inputs of the actor.
         goal_features: Value of the field `goal_features` that the networks were trained with.
+        control_hz: Action frequency that the networks were trained at, Hz.
         origin: Record of their training: name, task, environment steps and command line.
         critic_config: Configuration with which the critic was trained; None without a critic.
     """
@@ -57,6 +58,7 @@ class InitialNetworks:
     tensors: dict[str, Tensor]
     shape: NetworkShape
     goal_features: str
+    control_hz: float
     origin: dict[str, Any]
     critic_config: TrainConfig | None
 
@@ -213,7 +215,8 @@ def _of_run(folder: Path) -> InitialNetworks:
         'init_from': state.extra.get('init_from', {}),
     }
     tensors, shape = _unconditioned(tensors, config), network_shape(config)
-    return InitialNetworks(tensors, shape, config.goal_features, origin, config)
+    trained_with = config.goal_features, config.control_hz
+    return InitialNetworks(tensors, shape, *trained_with, origin, config)
 
 
 def _of_actor(name: str, path: Path) -> InitialNetworks:
@@ -248,7 +251,8 @@ def _of_actor(name: str, path: Path) -> InitialNetworks:
         'sha256': digest,
         'init_from': info.init_from,
     }
-    return InitialNetworks(tensors, info.shape, info.goal_features, origin, config)
+    trained_with = info.goal_features, info.control_hz
+    return InitialNetworks(tensors, info.shape, *trained_with, origin, config)
 
 
 def _read_usual(file: Path, source: Path) -> tuple[TrainingState, TrainConfig]:

@@ -396,7 +396,14 @@ def test_a_run_writes_a_policy_with_past_actions(tmp_path):
     assert read_initial_networks(str(run)).shape == actor.shape, 'it has no training state'
 
 
-def test_a_policy_without_one_critic_to_weigh_its_values_is_one_line(tmp_path, capsys):
-    arguments = ['--task', 'FetchPush', '--recipe', 'robust', '--set', 'value_weight=1']
+@pytest.mark.parametrize(
+    ('option', 'line'),
+    [
+        (['--set', 'value_weight=1'], 'HandReach has no single critic'),
+        (['--control-hz', '50'], 'HandReach was trained at 25 Hz, this run has 50 Hz'),
+    ],
+)
+def test_a_policy_that_cannot_be_imitated_is_one_line(option, line, tmp_path, capsys):
+    arguments = ['--task', 'HandReach', '--recipe', 'robust', *option]
     assert main([*arguments, '--output', str(tmp_path / 'run')]) == 2
-    assert 'no single critic' in one_line(capsys)
+    assert line in one_line(capsys)
