@@ -189,8 +189,8 @@ class PolicyNode(Node):
     def _load_for_one(self, name: str) -> tuple[LoadedPolicy | None, EpisodeStatus | None]:
         """Load the policy `name`; return the policy and the last status of a robot that it fits.
 
-        Without a robot, the status is None. The policy is None, too, if loading it needs the task
-        of a robot.
+        While no robot runs, the result is (policy, None), or (None, None) if loading the policy
+        needs the task of a robot.
 
         Raises:
             ValueError: If the policy cannot be loaded, or fits no robot.

@@ -215,8 +215,7 @@ def _of_run(folder: Path) -> InitialNetworks:
         'init_from': state.extra.get('init_from', {}),
     }
     tensors, shape = _unconditioned(tensors, config), network_shape(config)
-    trained_with = config.goal_features, config.control_hz
-    return InitialNetworks(tensors, shape, *trained_with, origin, config)
+    return InitialNetworks(tensors, shape, config.goal_features, config.control_hz, origin, config)
 
 
 def _of_actor(name: str, path: Path) -> InitialNetworks:
@@ -251,8 +250,7 @@ def _of_actor(name: str, path: Path) -> InitialNetworks:
         'sha256': digest,
         'init_from': info.init_from,
     }
-    trained_with = info.goal_features, info.control_hz
-    return InitialNetworks(tensors, info.shape, *trained_with, origin, config)
+    return InitialNetworks(tensors, info.shape, info.goal_features, info.control_hz, origin, config)
 
 
 def _read_usual(file: Path, source: Path) -> tuple[TrainingState, TrainConfig]:

@@ -222,10 +222,12 @@ def _run(options: argparse.Namespace, command: str) -> int:
 def _not_stored(jobs: Sequence[Job], folder: Path) -> list[Job]:
     """Return the jobs whose runs are not in the report `folder`; print how many runs are in it."""
     runs = read_runs(folder)
-    missing = [job for job in jobs if not holds(runs, job)]
-    # Their initial networks may be those of another machine.
-    needed = {job.after.key for job in missing if job.after and not job.after.is_trained}
-    missing = [job for job in jobs if job in missing or job.key in needed]
+    keys = {job.key for job in jobs if not holds(runs, job)}
+    # A first stage that another machine trained is trained again. It precedes the second in `jobs`.
+    for job in reversed(jobs):
+        if job.key in keys and job.after and not job.after.is_trained:
+            keys.add(job.after.key)
+    missing = [job for job in jobs if job.key in keys]
     if len(missing) < len(jobs):
         count = f'{len(jobs) - len(missing)} of {len(jobs)}'
         print(f'{count} runs are in {folder}; other --report and --output train them again')

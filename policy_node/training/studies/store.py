@@ -76,8 +76,8 @@ def own_fields(study: Study) -> set[str]:
     """Return the fields in which variants of a study may differ."""
     own = {name for arm in study.arms for name in arm.own}
     if any(arm.after for arm in study.arms):
-        # A second stage has no fields of a start.
-        own |= {name for start in study.starts.values() for name in start.fields}
+        # A second stage has other networks than the first, and no fields of a start.
+        own |= {'init_from', *(name for start in study.starts.values() for name in start.fields)}
     return own | set(STEP_COUNTS) if 'control_hz' in own else own
 
 
@@ -98,8 +98,7 @@ def require_alike(study: Study, jobs: Sequence[Job], folder: Path) -> None:
             stored, start = {**run['config'], 'seed': job.config.seed}, job.config.init_from
             differing = differing_fields(stored, job.config)
             # A shipped policy counts, too; the folder of another job depends on variant and seed.
-            before = stored.get('init_from', '')
-            if job.after is None and arm == job.arm.name and before != start:
+            if job.after is None and (before := stored.get('init_from', '')) != start:
                 differing['init_from'] = f'init_from {before!r}, now {start!r}'
             if arm != job.arm.name:
                 differing = {name: text for name, text in differing.items() if name not in own}

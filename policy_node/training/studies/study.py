@@ -175,13 +175,9 @@ class Study:
                     before = add(start.task, self.arm(arm.after) if arm.after else arm, seed)
                 # The name of a task stands for its shipped policy.
                 given = {**start.fields, 'init_from': str(before.folder) if before else start.task}
-            values = {'recipe': 'best', **REPEATABLE, **self.settings[task], **given}
-            values |= {**overrides, **arm.changes, 'seed': seed}
-            rate = values.get('control_hz', DEFAULT_CONTROL_HZ)
-            config = recipe_config(task, **{**values, **steps_at_rate(values, rate)})
-            factors = {name: to_flat(config)[name] * by for name, by in arm.factors.items()}
+            config = self._config(task, arm, {**given, **overrides, **arm.changes, 'seed': seed})
             folder = output / task / arm.name / f'seed{seed}'
-            jobs[key] = Job(arm, changed(config, **factors), folder, before, episodes)
+            jobs[key] = Job(arm, config, folder, before, episodes)
             return jobs[key]
 
         for task in (name for name in self.tasks if name in tasks):
@@ -193,6 +189,14 @@ class Study:
             names = ', '.join(arm.name for arm in arms)
             raise ValueError(f'--tasks {", ".join(tasks)}; allowed with --arms {names}: {allowed}')
         return list(jobs.values())
+
+    def _config(self, task: str, arm: Arm, fields: Mapping[str, Any]) -> TrainConfig:
+        """Return the settings of the task with `fields` replaced, at the rate of the run."""
+        values = {'recipe': 'best', **REPEATABLE, **self.settings[task], **fields}
+        rate = values.get('control_hz', DEFAULT_CONTROL_HZ)
+        config = recipe_config(task, **{**values, **steps_at_rate(values, rate)})
+        factors = {name: to_flat(config)[name] * by for name, by in arm.factors.items()}
+        return changed(config, **factors)
 
 
 @dataclass(frozen=True, slots=True)

@@ -224,9 +224,7 @@ def test_every_task_is_trained_with_its_best_recipe_after_what_it_starts_from(
     assert alone.after is None and alone.config.init_from == EGGS[0]
 
 
-def test_a_variant_that_continues_another_follows_it(
-    tmp_path: Path,
-) -> None:
+def test_a_variant_that_continues_another_follows_it(tmp_path: Path) -> None:
     tasks = ['--tasks', 'FetchReach', 'FetchSlide', '--output', str(tmp_path)]
     slide, finetuned, reach = jobs_of(*tasks, arms=('best', 'finetuned'))
     assert reach.config.task == 'FetchReach' and finetuned.after is slide

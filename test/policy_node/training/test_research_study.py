@@ -12,7 +12,12 @@ import pytest
 from policy_node.policies.files import write_file
 from policy_node.training.configuration.flat import to_flat
 from policy_node.training.runs.run_folder import STATE_FILE
-from policy_node.training.studies.command import jobs_from_arguments, main, parse_arguments
+from policy_node.training.studies.command import (
+    _not_stored,
+    jobs_from_arguments,
+    main,
+    parse_arguments,
+)
 from policy_node.training.studies.measures import (
     Curve,
     area_in_time,
@@ -346,6 +351,14 @@ def test_a_study_whose_runs_start_from_one_another_can_be_continued(tmp_path: Pa
     require_alike(study, jobs_of_tasks(*study.tasks, seeds=(0, 1)), tmp_path)
     with pytest.raises(ValueError, match=r"init_from '.*FetchPush.*', now 'FetchPush'"):
         require_alike(study, jobs_of_tasks('FetchPickAndPlace'), tmp_path)
+
+
+def test_first_stages_of_another_machine_are_trained_again(tmp_path: Path) -> None:
+    stages = (Arm('a', 'one'), Arm('b', 'two', after='a'), Arm('c', 'three', after='b'))
+    study = Study('stages', None, 'How many stages?', {'FetchReach': {}}, stages)
+    jobs = study.jobs(study.tasks, stages, (0, 1), {}, tmp_path / 'runs')
+    store(tmp_path, [job for job in jobs if job.key != ('FetchReach', 'c', 1)])
+    assert [job.key[1:] for job in _not_stored(jobs, tmp_path)] == [('a', 1), ('b', 1), ('c', 1)]
 
 
 PAGE = ROOT / 'docs' / 'research' / 'studies.md'
