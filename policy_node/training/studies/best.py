@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from msgs_spec.tasks import TASKS, task_spec
+from policy_node.training.configuration.recipes import FINE_TUNED
 from policy_node.training.studies.study import Arm, Start, Study
 
 # Long trainings first. Networks that can turn the block (XYZ) help in every other block task;
@@ -74,7 +75,7 @@ BEST = Study(
             'then recipe finetune',
             {'recipe': 'finetune'},
             after='best',
-            tasks=('FetchSlide', 'HandManipulateEggRotate'),
+            tasks=tuple(FINE_TUNED),
         ),
     ),
     seeds=1,

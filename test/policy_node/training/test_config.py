@@ -139,7 +139,7 @@ def test_bad_assignments_are_refused(text, match):
         ({**PEN, 'ticks_after_drop': -1, 'drop_is_lost': True}, 'it needs ticks_after_drop'),
         ({**PEN, 'drop_is_lost': True, 'condition': 'horizon'}, 'without condition horizon'),
         ({'task': 'FetchSlide', 'gamble': True}, 'FetchSlide uses its gripper; allowed: FetchR'),
-        ({'task': 'HandReach', 'recipe': 'finetune'}, 'for HandReach; allowed: FetchSlide and'),
+        ({'task': 'FetchReach', 'recipe': 'finetune'}, 'for FetchReach; allowed: FetchSlide and'),
         ({'algorithm': 'imitation'}, 'algorithm imitation needs init_from'),
         ({'recipe': 'robust', 'past_actions': 99}, 'past_actions 99; allowed: 0'),
         ({'recipe': 'robust', 'disturbance_scales': (1, -1)}, 'one or more factors 0 ... 10'),
