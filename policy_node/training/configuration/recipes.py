@@ -101,13 +101,14 @@ def _paper(task: str) -> dict[str, Any]:
 
 
 # Solved before anything else matters: targets four times as fast as the paper's, and four times the
-# updates (docs/research/ensembles).
+# updates (docs/research/ensembles). Costly actions are small near the goal, so the gripper does not
+# oscillate with 40 ms of latency.
 _REACH = {
     'total_steps': 40_000,
     'updates_per_cycle': 160,
     'random_epsilon': 0.2,
     'noise_std': 0.1,
-    'action_l2': 0.1,
+    'action_l2': 0.5,
     'target_update_interval': 10,
     'evaluate_every': 3_200,
 }
