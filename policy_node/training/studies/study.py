@@ -195,6 +195,9 @@ class Study:
         values = {'recipe': 'best', **REPEATABLE, **self.settings[task], **fields}
         rate = values.get('control_hz', DEFAULT_CONTROL_HZ)
         config = recipe_config(task, **{**values, **steps_at_rate(values, rate)})
+        if config.algorithm == 'imitation':
+            # Their runs have no training state, so no job of a study would ever be finished.
+            raise ValueError(f'{task}/{arm.name} has algorithm imitation; studies cannot run it')
         factors = {name: to_flat(config)[name] * by for name, by in arm.factors.items()}
         return changed(config, **factors)
 

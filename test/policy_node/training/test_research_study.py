@@ -361,6 +361,13 @@ def test_first_stages_of_another_machine_are_trained_again(tmp_path: Path) -> No
     assert [job.key[1:] for job in _not_stored(jobs, tmp_path)] == [('a', 1), ('b', 1), ('c', 1)]
 
 
+def test_a_study_of_imitations_is_refused_before_it_trains(tmp_path: Path) -> None:
+    arms = (Arm('robust', 'imitation', {'recipe': 'robust'}),)
+    study = Study('robust', None, '?', {'FetchReach': {}}, arms)
+    with pytest.raises(ValueError, match='FetchReach/robust has algorithm imitation; studies'):
+        study.jobs(study.tasks, arms, (0,), {}, tmp_path)
+
+
 PAGE = ROOT / 'docs' / 'research' / 'studies.md'
 FEW = ['--seeds', '0', '--steps', '800', '--episodes', '2']
 FEW += options_of(num_envs=8, evaluation_episodes=4, evaluate_every=400)
