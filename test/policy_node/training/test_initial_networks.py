@@ -289,7 +289,7 @@ def test_networks_that_do_not_fit_are_rejected_before_anything_is_written(
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize('task', [n for n in TASKS if n.startswith(('HandM', 'FetchSlide'))])
+@pytest.mark.parametrize('task', [n for n in TASKS if n.startswith(('Hand', 'FetchSlide'))])
 def test_finetune_starts_from_the_shipped_networks(task):
     config = recipe_config(task, 'finetune')
     networks = read_initial_networks(config.init_from)
