@@ -283,7 +283,7 @@ def _object_in_hand(task: str) -> dict[str, Any]:
 def _finetune(task: str) -> dict[str, Any]:
     """Return the fields of the recipe `finetune`, which trains a shipped policy further.
 
-    For block and pen tasks and HandManipulateEggFull, three settings keep the critic from
+    For tasks without own fields in `FINE_TUNED`, three settings keep the critic from
     overestimating values: no goals from the future of the transition, a short horizon and rare
     updates of the actor (docs/lab_notes/training_log.md).
 
