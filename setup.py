@@ -97,7 +97,7 @@ setup(
     # Without rclpy and the messages: in a ROS workspace, pip must not replace them. Without `~=`:
     # colcon cannot read it; `colcon test` would pass without running tests.
     install_requires=[
-        'gymnasium>=1.0',
+        'gymnasium>=1.2',
         'gymnasium-robotics>=1.4.2,<1.5',
         'lz4>=4',
         'mcap>=1.5',
@@ -106,7 +106,7 @@ setup(
         'pillow>=8.3.2',
         'PyYAML>=6',
         'rich>=13',
-        'rosbags>=0.10',
+        'rosbags>=0.10.8',
         'safetensors>=0.4',
         'shtab>=1.7',
         'threadpoolctl>=3',

@@ -127,10 +127,16 @@ class ObservationAssembler:
             strange = ~np.isfinite(vectors[spec.name].reshape(-1, spec.size)).all(axis=0)
             if spec.name == 'joint_states':
                 labels = [f'{part.name} of {name}' for part in spec.layout for name in spec.names]
-                found = [labels[place] for place in np.flatnonzero(strange).tolist()]
-                found = [label for label in found if not label.startswith('effort')]
-                if found:
+                places = filter(self._reads, np.flatnonzero(strange).tolist())
+                if found := [labels[place] for place in places]:
                     return f'{spec.name}: no finite {first_of(found, _NAMED)}'
             elif strange.any():
                 return f'{spec.name}: not every value is finite'
         return 'a value is too large for an observation'
+
+    def _reads(self, place: int) -> bool:
+        """Return whether the observation depends on `joint_states[place]`."""
+        readings = {spec.name: np.ones(spec.size) for spec in self.topics}
+        readings['joint_states'][place] = np.nan
+        found = observation(self._task, readings, self._tick_duration)
+        return not np.isfinite(found).all()

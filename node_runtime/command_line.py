@@ -146,6 +146,17 @@ def say(text: object) -> None:
     print(printable(str(text)), flush=True)
 
 
+def show_table(table: Any, least_width: int = 0) -> None:
+    """Print a table of Rich on stdout, as wide as the terminal and at least `least_width`."""
+    from rich.console import Console
+
+    console = Console(width=max(Console().width, least_width))
+    # If the output is closed, `print` raises BrokenPipeError; Rich would end the process with 1.
+    with console.capture() as captured:
+        console.print(table)
+    print(captured.get(), end='', flush=True)
+
+
 def given_command(name: str, arguments: Sequence[str] | None) -> str:
     """Return `name` and `arguments` (None: those of `sys.argv`) as one line, quoted for a shell."""
     words = [*name.split(), *(sys.argv[1:] if arguments is None else arguments)]

@@ -1,6 +1,6 @@
 """Run a simulated robot and its policy in two processes and print a row for each logged episode.
 
-The rows come from the episode files. The demo also subscribes to the robot, to show its progress.
+The rows come from the episode files.
 """
 
 from __future__ import annotations
@@ -14,9 +14,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskID, TextColumn
-
 from fetch_hand_sim.commands.node_processes import (
     is_actor_shipped,
     open_log,
@@ -27,7 +24,6 @@ from fetch_hand_sim.episode_log import EpisodeOutcome, EpisodeRecord, read_summa
 from msgs_spec.codecs import decode_status
 from msgs_spec.parameters import LARGEST_SEED
 from msgs_spec.tasks import TaskSpec, task_spec
-from msgs_spec.text import printable
 from msgs_spec.tick import EpisodeStatus
 from msgs_spec.topics import DIAGNOSTICS, topic, topics
 from node_runtime.command_line import (
@@ -38,6 +34,7 @@ from node_runtime.command_line import (
     complain,
     require_extra,
     run_command,
+    say,
     whole_number,
 )
 from node_runtime.node_main import StopSignals, destroy, find_place_for_logs
@@ -61,22 +58,19 @@ class Watcher:
     """A ROS node that follows the robot of the demo.
 
     Attributes:
-        status: The last status of the robot; None before the first.
-        ticks: Ticks of the current episode so far.
+        has_started: Whether the first episode has started.
     """
 
     def __init__(self, spec: TaskSpec) -> None:
         import rclpy
         from rclpy.executors import SingleThreadedExecutor
 
-        self.status: EpisodeStatus | None = None
-        self.ticks = 0
+        self.has_started = False
         self._spec = spec
         self._node = rclpy.create_node('demo')
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self._node)
-        for name, callback in (('episode_status', self._on_status), ('reward', self._on_reward)):
-            subscribe(self._node, topic(spec, name), callback)
+        subscribe(self._node, topic(spec, 'episode_status'), self._on_status)
 
     def others(self) -> str:
         """Return what else is running and would disturb the demo, such as `a robot`; '' if none."""
@@ -102,19 +96,6 @@ class Watcher:
         """Wait at most 50 ms for a message and handle it."""
         self._executor.spin_once(timeout_sec=0.05)
 
-    def show(self, progress: Progress, bar: TaskID) -> None:
-        """Update the progress bar of the current episode; do nothing before the first episode."""
-        status = self.status
-        if status is None or status.phase == 'waiting':
-            return
-        progress.update(
-            bar,
-            description=f'episode {status.episode}',
-            completed=self.ticks,
-            total=task_spec(status.task, control_hz=status.control_hz).episode_ticks,
-            note=f'tick {self.ticks}, seed {status.seed}',
-        )
-
     def close(self, exit_code: int) -> None:
         """Destroy the ROS node; end this process with `exit_code` if that takes over 10 s."""
         self._executor.remove_node(self._node)
@@ -126,20 +107,15 @@ class Watcher:
         except ValueError:
             return
         # A robot with another task is not the one that this demo started.
-        if status.task == self._spec.name:
-            self.status, self.ticks = status, status.tick
-
-    def _on_reward(self, message: Any) -> None:
-        del message
-        self.ticks += 1
+        if status.task == self._spec.name and status.phase != 'waiting':
+            self.has_started = True
 
 
 class Demo:
     """Runs a simulator node and a policy node until all episodes are logged."""
 
-    def __init__(self, options: argparse.Namespace, console: Console) -> None:
+    def __init__(self, options: argparse.Namespace) -> None:
         self._options = options
-        self._console = console
         self._spec = task_spec(options.task)
         self._directory = Path(options.episode_dir)
         self._known = self._episodes()
@@ -175,11 +151,10 @@ class Demo:
                     complain(_NAME, 'stopping')
             finally:
                 codes = [stop_node(process) for process in reversed(nodes)]
-            self._print_new_rows(self._console)
+            self._print_new_rows()
             if any(codes) or (len(self._outcomes) < self._options.episodes and not stop):
-                text = Path(output.name).read_text()
-                self._console.print(text, markup=False, highlight=False)
-                self._console.print(f'sim_node and policy_node ended with exit codes {codes}')
+                print(Path(output.name).read_text())
+                say(f'sim_node and policy_node ended with exit codes {codes}')
                 return EXIT_FAILURE
         self._print_summary(time.monotonic() - began)
         return EXIT_SUCCESS
@@ -189,7 +164,7 @@ class Demo:
             return str(self._options.policy)
         if is_actor_shipped(self._spec.name):
             return self._spec.name
-        self._console.print(f'No actor is shipped for {self._spec.name} yet: commands are random.')
+        say(f'No actor is shipped for {self._spec.name} yet: commands are random.')
         return 'random'
 
     def _sim_parameters(self) -> dict[str, object]:
@@ -204,25 +179,20 @@ class Demo:
     def _watch(
         self, watcher: Watcher, nodes: Sequence[subprocess.Popen[str]], stop: StopSignals
     ) -> None:
-        columns = (TextColumn('{task.description}'), BarColumn(), TextColumn('{task.fields[note]}'))
-        print(_COLUMNS.format('episode', 'seed', 'steps', 'return', 'success', 'file'), flush=True)
+        say(_COLUMNS.format('episode', 'seed', 'steps', 'return', 'success', 'file'))
         deadline = time.monotonic() + _START_TIMEOUT
-        with Progress(*columns, console=self._console, transient=True) as progress:
-            bar = progress.add_task('starting', total=self._spec.episode_ticks, note='')
-            while not stop and all(process.poll() is None for process in nodes):
-                watcher.spin()
-                watcher.show(progress, bar)
-                self._print_new_rows(progress.console)
-                has_started = watcher.status is not None and watcher.status.phase != 'waiting'
-                if not has_started and time.monotonic() > deadline:
-                    return
+        while not stop and all(process.poll() is None for process in nodes):
+            watcher.spin()
+            self._print_new_rows()
+            if not watcher.has_started and time.monotonic() > deadline:
+                return
 
     def _episodes(self) -> set[Path]:
         if not self._directory.is_dir():
             return set()
         return {path for path in self._directory.iterdir() if not path.name.startswith('.')}
 
-    def _print_new_rows(self, console: Console) -> None:
+    def _print_new_rows(self) -> None:
         for path in sorted(self._episodes() - self._known):
             self._known.add(path)
             try:
@@ -239,20 +209,17 @@ class Demo:
             success = 'yes' if outcome.is_success else 'no'
             total = f'{outcome.episode_return or 0.0:g}'
             row = (record.episode, record.seed, outcome.steps or 0, total, success, path)
-            text = printable(_COLUMNS.format(*row))
-            console.print(text, markup=False, highlight=False, soft_wrap=True)
+            say(_COLUMNS.format(*row))
 
     def _print_summary(self, seconds: float) -> None:
         count = len(self._outcomes)
         successes = sum(outcome.is_success is True for outcome in self._outcomes)
         steps = sum(outcome.steps or 0 for outcome in self._outcomes)
         mean = sum(outcome.episode_return or 0.0 for outcome in self._outcomes) / max(count, 1)
-        self._console.print(
+        say(
             f'{self._spec.name}: {successes} of {count} episodes succeeded, mean return '
             f'{mean:.2f}, {steps} steps, {seconds:.1f} s with start-up. Episodes are in '
-            f'{printable(str(self._directory))}/',
-            highlight=False,
-            soft_wrap=True,
+            f'{self._directory}/'
         )
 
 
@@ -311,6 +278,6 @@ def _run(options: argparse.Namespace) -> int:
     stop = StopSignals()
     rclpy.init(args=[], signal_handler_options=rclpy.signals.SignalHandlerOptions.NO)
     try:
-        return Demo(options, Console()).run(stop)
+        return Demo(options).run(stop)
     finally:
         rclpy.try_shutdown()

@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
@@ -34,6 +33,7 @@ from node_runtime.command_line import (
     CommandParser,
     complain,
     run_command,
+    show_table,
     usage_errors,
 )
 
@@ -88,8 +88,9 @@ def _name(file: Path) -> str:
 
     If the directory has no `metadata.yaml`, return the file name without `_0.mcap`.
     """
-    is_bag = (file.parent / 'metadata.yaml').is_file()
-    return file.parent.name if is_bag else file.stem.removesuffix('_0')
+    directory = file.absolute().parent
+    is_bag = (directory / 'metadata.yaml').is_file()
+    return directory.name if is_bag else file.stem.removesuffix('_0')
 
 
 def _known(number: int | float | None) -> str:
@@ -125,7 +126,8 @@ def _run(options: argparse.Namespace) -> int:
     if options.json:
         print(json.dumps([_as_json(episode) for episode in shown], indent=2))
     else:
-        _print_table(shown)
+        if shown:
+            show_table(make_table(shown), _WIDEST)
         successes = sum(episode.outcome.is_success is True for episode in shown)
         filtered = len(episodes) - len(shown)
         print(f'{len(shown)} episodes, {successes} successes; {filtered} filtered')
@@ -137,14 +139,6 @@ def _run(options: argparse.Namespace) -> int:
     for skipped in errors:
         complain(_NAME, f'skipped {skipped}')
     return EXIT_FAILURE if errors else EXIT_SUCCESS
-
-
-def _print_table(episodes: Sequence[EpisodeSummary]) -> None:
-    if episodes:
-        console = Console(width=_WIDEST)
-        with console.capture() as captured:
-            console.print(make_table(episodes))
-        print(captured.get(), end='')
 
 
 def _as_json(episode: EpisodeSummary) -> dict[str, Any]:

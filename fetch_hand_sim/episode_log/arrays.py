@@ -11,7 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fetch_hand_sim.episode_log.files import EpisodeReadError, expand_episodes, read_each
-from fetch_hand_sim.episode_log.metadata import EpisodeOutcome, EpisodeRecord, HasOutcome
+from fetch_hand_sim.episode_log.metadata import (
+    DIVERGED,
+    EpisodeOutcome,
+    EpisodeRecord,
+    HasOutcome,
+)
 from fetch_hand_sim.episode_log.reader import Episode, one_line_errors, read_episode
 from msgs_spec.arrays import Array, Flags
 from msgs_spec.codecs import TopicCodec
@@ -72,6 +77,7 @@ def load_episodes(
     """Load one episode, or all episodes in a directory, sorted by name; [] if it has none.
 
     Interrupted episodes are included up to their last whole tick; their `is_complete` is False.
+    If the simulation diverged, the last step is left out, because it leads to a new episode.
 
     Args:
         path: A bag directory, an MCAP file, or a directory that contains several of these.
@@ -106,6 +112,9 @@ def _decode(file: Episode) -> EpisodeArrays:
     # A cut-off episode may contain a part of its last tick.
     ticks = min(file.count(name) for name in (*names, 'is_success'))
     ticks = min(ticks, 1 + file.count('applied_command'))
+    outcome = EpisodeOutcome.parse(file.result)
+    if outcome.reason == DIVERGED and ticks > 1:
+        ticks -= 1
     stamps, first = _codec(task, names[0]).decode_many(file.rows(names[0])[1][:ticks])
     if not (np.diff(stamps) > 0).all():
         raise ValueError('stamps do not grow')
@@ -113,7 +122,6 @@ def _decode(file: Episode) -> EpisodeArrays:
     rewards = _unstamped_vectors(file, task, 'reward', stamps, first=1)[:, 0]
     commands = _unstamped_vectors(file, task, 'applied_command', stamps, first=1)
     steps = ticks - 1
-    outcome = EpisodeOutcome.parse(file.result)
     if outcome.is_complete and outcome.steps not in (None, steps):
         raise ValueError(f'it records {outcome.steps} steps and contains {steps}')
     return EpisodeArrays(

@@ -39,6 +39,8 @@ Number = TypeVar('Number', int, float)
 
 # End reason of an episode that was cut off, in its recovered file.
 RECOVERED = 'cut off, recovered later'
+# End reason of an episode whose simulation diverged; its last tick is the state after the reset.
+DIVERGED = 'diverged'
 # Seeds and numbers of episodes are parameters of a node and columns of a table: int64.
 _LARGEST = 2**63 - 1
 _SHOWN = 40

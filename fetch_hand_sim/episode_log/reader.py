@@ -187,12 +187,13 @@ def one_line_errors(file: Path) -> Iterator[None]:
 
 def _why_unfinished(file: Path) -> str:
     """Return why the file of an unfinished episode is incomplete; '' for a finished episode."""
-    if files.active_name(file.parent) is None:
+    active = file.absolute().parent
+    if files.active_name(active) is None:
         return ''
     with suppress(OSError):
         if files.is_locked(file):
             return 'still being written'
-    directory = shlex.quote(str(file.parent.parent))
+    directory = shlex.quote(str(active.parent))
     return (
         f'truncated by a kill or a full disk; `fetch_hand_sim episodes recover {directory}` ends it'
     )

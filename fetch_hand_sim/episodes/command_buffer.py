@@ -32,7 +32,8 @@ class CommandBuffer:
     Attributes:
         far_out: Number of commands that were beyond a limit by more than twice the range.
         last_far_out: Description of the last such value and its limits; '' if there was none.
-        last_rejection: Why the last command was rejected; '' if it was valid.
+        last_rejection: Why the last rejected command was rejected; '' before.
+        is_last_rejected: Whether the last command was rejected.
         has_fresh_command: Whether a command arrived since the last `take` or `start_episode`.
         answered_stamp: Stamp of the observation from which the last command was computed,
             nanoseconds; None if the command names none.
@@ -51,6 +52,7 @@ class CommandBuffer:
         self.rejected: Counter[str] = Counter()
         self.last_far_out = ''
         self.last_rejection = ''
+        self.is_last_rejected = False
         self._clock = clock
         self._resting = np.zeros(robot.action_size)
         self._command: Array | None = None
@@ -117,6 +119,7 @@ class CommandBuffer:
         """Count a rejected message under the key `reason`; `last_rejection` becomes `line`."""
         self.rejected[reason] += 1
         self.last_rejection = line
+        self.is_last_rejected = True
 
     def take(self) -> Array:
         """Return the command of the next tick, (action size,), command units, within limits.
@@ -151,7 +154,7 @@ class CommandBuffer:
         self.has_fresh_command = True
         self.answered_stamp = answered_stamp
         self.accepted += 1
-        self.last_rejection = ''
+        self.is_last_rejected = False
 
     def _count_clipping(self, command: Array) -> None:
         self.clipped += 1

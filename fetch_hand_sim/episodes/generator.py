@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -17,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fetch_hand_sim.episode_log import EpisodeDirectory, EpisodeLogError, EpisodeWriter
+from fetch_hand_sim.episode_log.metadata import DIVERGED
 from fetch_hand_sim.episodes.recorder import (
-    DIVERGED,
     LoggedEpisode,
     RecordingContext,
     episode_result,
@@ -81,7 +82,7 @@ class EpisodeGenerator:
         episodes, one after the other.
 
         Raises:
-            EpisodeLogError: If a file cannot be written.
+            EpisodeLogError: If a file cannot be written, after finished episodes were yielded.
             KeyboardInterrupt: At Ctrl-C, after finished episodes were yielded.
         """
         with ThreadPoolExecutor(_COMPLETING_THREADS, 'episode_log') as pool:
@@ -95,8 +96,10 @@ class EpisodeGenerator:
                     for robot in robots:
                         waiting.append(pool.submit(_complete, self._write(robot), robot))
                 yield from _completed(waiting)
-            except KeyboardInterrupt:
-                yield from _completed(waiting)
+            except (KeyboardInterrupt, EpisodeLogError):
+                while waiting:
+                    with suppress(EpisodeLogError):
+                        yield from _completed(waiting)
                 raise
 
     def _robot(self, episode: int, first_seed: int) -> _Robot:
@@ -162,9 +165,13 @@ class EpisodeGenerator:
 
 
 def _completed(waiting: deque[Future[LoggedEpisode]]) -> Iterator[LoggedEpisode]:
-    """Wait for the results and yield them in order; `waiting` keeps those not yet yielded."""
+    """Wait for the results and yield them in order; `waiting` keeps the results after an error."""
     while waiting:
-        logged = waiting[0].result()
+        try:
+            logged = waiting[0].result()
+        except EpisodeLogError:
+            waiting.popleft()
+            raise
         waiting.popleft()
         yield logged
 

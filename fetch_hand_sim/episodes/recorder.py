@@ -31,6 +31,7 @@ from fetch_hand_sim.episode_log import (
     EpisodeWriter,
     episode_metadata,
 )
+from fetch_hand_sim.episode_log.metadata import DIVERGED
 from fetch_hand_sim.simulation import Simulation
 from fetch_hand_sim.simulation.models import compiled_bytes
 from msgs_spec.tick import EpisodeStatus, Tick
@@ -58,8 +59,6 @@ _SLOW_PERIOD = 10.0
 _ASK_AFTER = 0.1
 _PATIENCE = 3.0
 _LAST_CHANCE = 5.0
-# End reason of an episode whose simulation diverged.
-DIVERGED = 'diverged'
 
 
 class RecordingContext:

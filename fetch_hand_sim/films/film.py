@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import IO
 
 import numpy as np
-from PIL import Image, TiffImagePlugin
+from PIL import Image, ImageSequence, TiffImagePlugin
 
 from msgs_spec.arrays import Picture
 
@@ -52,11 +52,9 @@ class Roll:
         self._writer.newFrame()
         self._count += 1
 
-    def picture(self, number: int) -> Picture:
-        """Return picture `number`, from 0, as a read-only array."""
-        image = self.open()
-        image.seek(number)
-        return np.asarray(image)
+    def __iter__(self) -> Iterator[Picture]:
+        """Yield the pictures as read-only arrays."""
+        return map(np.asarray, ImageSequence.Iterator(self.open()))
 
     def open(self) -> Image.Image:
         """Return a Pillow image whose frames are the pictures; each is decoded when needed."""
@@ -140,10 +138,10 @@ def write_animation(
 def _with_one_palette(roll: Roll) -> Iterator[Image.Image]:
     """Yield the pictures as palette images with one common palette; separate palettes flicker."""
     some = range(0, len(roll), max(1, len(roll) // _PALETTE_SAMPLES))
-    samples = Image.fromarray(np.concatenate([roll.picture(number) for number in some]))
-    palette = samples.quantize(_GIF_COLORS)
-    for number in range(len(roll)):
-        yield Image.fromarray(roll.picture(number)).quantize(palette=palette)
+    samples = [picture for number, picture in enumerate(roll) if number in some]
+    palette = Image.fromarray(np.concatenate(samples)).quantize(_GIF_COLORS)
+    for picture in roll:
+        yield Image.fromarray(picture).quantize(palette=palette)
 
 
 def _write_mp4(path: Path, pictures: Iterable[Picture], fps: float, keyframe_every: int) -> None:

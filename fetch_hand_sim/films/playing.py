@@ -45,7 +45,7 @@ class Film:
             raise ValueError(f'fps {fps!r}; allowed: a number')
         if not _RATES[0] <= fps <= _RATES[1]:
             raise ValueError(f'fps {fps:g}; allowed: {_RATES[0]:g} ... {_RATES[1]:g}')
-        self.fps = fps
+        self.fps = float(fps)
         self._roll = Roll()
         self._shape: tuple[int, ...] = ()
         self._html = ''
@@ -83,7 +83,7 @@ class Film:
 
     def __iter__(self) -> Iterator[Picture]:
         """Yield the pictures, read-only."""
-        return (self._roll.picture(number) for number in range(len(self)))
+        return iter(self._roll)
 
     def save(self, path: str | Path) -> Path:
         """Write the film as .gif, .webp or .mp4 and return the path.

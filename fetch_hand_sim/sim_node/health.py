@@ -170,11 +170,13 @@ class Health:
 
     def _waiting(self) -> str:
         """Return a line that names the tick that waits for a command, and likely causes."""
-        runner, rejection = self._robot.runner, self._robot.buffer.last_rejection
+        runner, buffer = self._robot.runner, self._robot.buffer
         tick = f'tick {runner.current.tick + 1} of episode {runner.episode}'
         if runner.is_between_episodes:
             tick = f'the start of episode {runner.episode}'
-        last = f'; the last command was rejected: {rejection}' if rejection else ''
+        last = ''
+        if buffer.is_last_rejected:
+            last = f'; the last command was rejected: {buffer.last_rejection}'
         return f'{tick} waits for a valid command; {self._command_source()}{last}'
 
     def _command_source(self) -> str:

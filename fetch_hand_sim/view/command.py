@@ -52,6 +52,9 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument('--task', choices=list(TASKS), metavar='TASK', help='one of the tasks')
     parser.add_argument('--robot', type=_namespace, default='', help='namespace of the robot')
     parser.add_argument('--policy', default='', help='policy to start with --task')
+    parser.add_argument(
+        '--trust', action='store_true', help='allow policies that run code of their own'
+    )
     parser.add_argument('--episode-dir', default='', help='log episodes of --task here')
     parser.add_argument('--port', type=int, default=0, help='default: the first free from 8080')
     parser.add_argument(
@@ -70,10 +73,10 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         parser.error(f'--port {options.port}; allowed: 0 ... 65535')
     if not options.wait >= 0.0:
         parser.error(f'--wait {options.wait:g}; allowed: 0 and more')
-    of_a_robot = _given(options, 'task', 'robot', 'policy', 'episode_dir')
+    of_a_robot = _given(options, 'task', 'robot', 'policy', 'trust', 'episode_dir')
     if options.path is not None and of_a_robot:
         parser.error(f'a file and {of_a_robot} exclude each other')
-    options.for_a_start = _given(options, 'policy', 'episode_dir')
+    options.for_a_start = _given(options, 'policy', 'trust', 'episode_dir')
     if options.for_a_start and not options.task:
         parser.error(f'{options.for_a_start}: only together with --task, for the robot it starts')
     return options

@@ -173,7 +173,7 @@ def _start(options: argparse.Namespace, node: Node, log: IO[str]) -> Nodes:
         settings['publish_clock'] = False
     # The namespace may come from `--robot` or from `--ros-args`.
     nodes: dict[str, dict[str, object]] = {
-        'policy_node': {'policy': str(policy)},
+        'policy_node': {'policy': str(policy), 'trust': options.trust},
         'sim_node': settings,
     }
     return dict(zip(nodes, start_nodes(nodes, log, node.get_namespace()), strict=True))

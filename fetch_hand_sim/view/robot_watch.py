@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.node import Node, NodeNameNonExistentError
@@ -31,8 +32,8 @@ _FOLLOWING = replace(WATCHING, depth=50)
 ANY_TASK = next(iter(TASKS.values()))
 # Topics of a tick in the order of publication. A reset has no reward and no command.
 _FIRST, _LAST = 'joint_states', 'applied_command'
-_NEEDED = (_FIRST, 'desired_goal', 'achieved_goal', 'is_success')
-_STATE = (*_NEEDED, 'reward', _LAST)
+_NEEDED = (_FIRST, 'desired_goal', 'achieved_goal')
+_STATE = (*_NEEDED, 'is_success', 'reward', _LAST)
 # Seconds between the end of a robot's subscriptions and those to another robot. The executor
 # removes the old ones after the callback; until then a topic cannot have another type.
 _CHANGE_TIME = 0.2
@@ -213,17 +214,21 @@ class RobotWatch:
         return collect
 
     def _finish_tick(self, status: EpisodeStatus | None = None) -> None:
-        """Call `on_tick` if joints, goals and success have arrived; `status` is for this tick."""
+        """Call `on_tick` if joints and goals have arrived; `status` is for this tick.
+
+        The position of a joint that the robot does not publish is 0.
+        """
         values, spec = self._values, self.spec
         if spec is None or any(name not in values for name in _NEEDED):
             return
         self._values = {}
+        positions = values['joint_states'][: len(spec.robot.joints)]
         frame = Frame(
-            joint_position=values['joint_states'][: len(spec.robot.joints)],
+            joint_position=np.where(np.isfinite(positions), positions, 0.0),
             desired_goal=values['desired_goal'],
             achieved_goal=values['achieved_goal'],
             object_pose=values.get('object_pose'),
-            is_success=bool(values['is_success'][0]),
+            is_success='is_success' in values and bool(values['is_success'][0]),
         )
         reward = float(values['reward'][0]) if 'reward' in values else None
         command = values.get('applied_command')

@@ -192,6 +192,8 @@ class Camera:
         self._due = max(self._due + self._period, began)
         if self._renderer is None:
             self._renderer = SceneRenderer(scene, self.width, self.height)
+            # The time to open OpenGL is not that of a picture.
+            began = self._clock()
         picture = self._renderer.render(frame)
         self.pictures += 1
         self.picture_time.add(self._clock() - began)

@@ -23,6 +23,7 @@ from node_runtime.command_line import (
     run_command,
     say,
 )
+from policy_node.policies.files import require_writable
 from policy_node.policies.loading import actor_path
 from policy_node.policies.onnx import INPUTS, OUTPUT, OnnxActor
 
@@ -49,6 +50,7 @@ def _run(options: argparse.Namespace) -> int:
         require_extra(extra)
     if options.target.suffix != '.onnx':
         raise UsageError(f'target {str(options.target)!r}; allowed: a name that ends in .onnx')
+    require_writable(options.target)
     try:
         difference = export(actor_path(options.actor), options.target)
     except ValueError as error:
@@ -81,7 +83,6 @@ def export(source: Path, target: Path) -> float:
         raise ValueError(f'{source}: an actor with past actions cannot be written as ONNX')
     sizes = (shape.observation_size, shape.goal_size)
     batch = torch.export.Dim('batch')
-    target.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=target.parent) as folder:
         partial = Path(folder) / target.name
         with warnings.catch_warnings():

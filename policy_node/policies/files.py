@@ -19,6 +19,7 @@ from safetensors.numpy import load as from_bytes
 from safetensors.numpy import save as to_bytes
 
 from msgs_spec.text import one_line
+from node_runtime.command_line import UsageError
 
 # Bytes. The largest actor of the paper's size has 0.7 MB, a training state a few megabytes.
 LARGEST_POLICY = 64 * 2**20
@@ -154,3 +155,22 @@ def parse_tensors(data: bytes, path: str | Path) -> tuple[dict[str, NDArray[Any]
         raise ValueError(f'{path} is not a readable safetensors file: {one_line(error)}') from None
     # The library has checked the header but returns no metadata for bytes.
     return arrays, json.loads(data[8:end]).get('__metadata__') or {}
+
+
+def require_writable(file: Path) -> None:
+    """Create the folder of `file` and check that the file can be written.
+
+    The file is not created or changed. Commands call this before long work.
+
+    Raises:
+        UsageError: If the file cannot be written.
+    """
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        is_folder, exists = file.is_dir(), file.exists()
+    except OSError as error:
+        raise UsageError(f'{file} cannot be written: {error.strerror}') from None
+    if is_folder:
+        raise UsageError(f'{file} cannot be written: it is a folder')
+    if not os.access(file if exists else file.parent, os.W_OK):
+        raise UsageError(f'{file} cannot be written: it is read-only')

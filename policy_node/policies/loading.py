@@ -135,7 +135,7 @@ def load_policy(
     name = str(name)
     if name in (RANDOM, RESTING):
         return _untrained(name, task)
-    if is_python_name(name) and not Path(name).exists():
+    if is_python_name(name) and not os.path.exists(name):
         if not trust:
             raise ValueError(
                 f'{name} runs code. If you trust it, add --trust (policy_node: trust:=true)'

@@ -20,6 +20,7 @@ from node_runtime.command_line import (
     require_extra,
     run_command,
     say,
+    show_table,
     usage_errors,
     whole_number,
 )
@@ -44,7 +45,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(options: argparse.Namespace) -> int:
     require_extra('train')
-    from rich.console import Console
     from rich.table import Table
 
     from policy_node.training.values_and_returns import measure
@@ -59,7 +59,7 @@ def _run(options: argparse.Namespace) -> int:
         value, total = each.value, each.episode_return
         numbers = (value, total, value - total, each.correlation)
         table.add_row(str(each.tick), *(f'{number:.2f}' for number in numbers))
-    Console().print(table)
+    show_table(table)
     return EXIT_SUCCESS
 
 

@@ -20,7 +20,7 @@ from node_runtime.command_line import (
     whole_number,
 )
 from node_runtime.signals import EXIT_INTERRUPTED
-from policy_node.policies.files import to_csv, to_json
+from policy_node.policies.files import require_writable, to_csv, to_json
 from policy_node.policies.loading import load_policy
 from policy_node.policies.policy import LoadedPolicy
 from policy_node.training.evaluation import (
@@ -37,7 +37,6 @@ from policy_node.training.policy_options import (
     load_chosen_policy,
     make_chosen_simulation,
     policy_errors,
-    require_writable,
     write_result,
 )
 

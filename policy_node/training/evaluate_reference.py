@@ -24,14 +24,13 @@ from node_runtime.command_line import (
     say,
     whole_number,
 )
-from policy_node.policies.files import to_json
+from policy_node.policies.files import require_writable, to_json
 from policy_node.policies.policy import Policy
 from policy_node.training.evaluation import FIRST_SEED, wilson_interval
 from policy_node.training.policy_options import (
     add_policy_options,
     load_chosen_policy,
     policy_errors,
-    require_writable,
     write_result,
 )
 

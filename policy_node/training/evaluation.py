@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
 from fetch_hand_sim.simulation import Simulation
 from fetch_hand_sim.simulation.tasks.hand_manipulate import PALM_HEIGHT
 from msgs_spec.tasks import GoalKind, TaskSpec
+from node_runtime.command_line import show_table
 from policy_node.policies.policy import Policy
 
 # Far from the seeds of training and of its evaluations.
@@ -293,7 +293,7 @@ def print_table(report: dict[str, Any]) -> None:
     if 'against' in report:
         _add_comparison(table, report['against'])
     # Numbers are whole in a terminal that has no room for them.
-    Console(width=max(Console().width, _NARROWEST)).print(table)
+    show_table(table, _NARROWEST)
 
 
 def _add_comparison(table: Table, other: dict[str, Any]) -> None:

@@ -128,10 +128,11 @@ def _warn_of_repeated_seeds(options: argparse.Namespace, task: str) -> None:
         return  # Writing reports the error.
     series = range(options.first_seed, options.first_seed + options.episodes)
     if twice := sum(seed in seeds for seed in series):
+        after = max(seeds) + 1
+        fits = after + options.episodes - 1 <= LARGEST_SEED
+        remedy = f'; --first-seed {after} avoids them' if fits else ''
         complain(
-            _NAME,
-            f'{options.output} already contains {twice} of these seeds of {task}; '
-            f'--first-seed {max(seeds) + 1} avoids them',
+            _NAME, f'{options.output} already contains {twice} of these seeds of {task}{remedy}'
         )
 
 

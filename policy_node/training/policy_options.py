@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -87,24 +86,6 @@ def make_chosen_simulation(options: argparse.Namespace, loaded: LoadedPolicy) ->
             disturbances=options.disturbances,
         )
     return simulation
-
-
-def require_writable(file: Path) -> None:
-    """Create the folder of `file` and check that the file can be written.
-
-    The file is not created or changed. Commands call this before long work.
-
-    Raises:
-        UsageError: If the file cannot be written.
-    """
-    try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UsageError(f'{file} cannot be written: {error.strerror}') from None
-    if file.is_dir():
-        raise UsageError(f'{file} cannot be written: it is a folder')
-    if not os.access(file if file.exists() else file.parent, os.W_OK):
-        raise UsageError(f'{file} cannot be written: it is read-only')
 
 
 def write_result(file: Path, data: bytes) -> None:

@@ -33,7 +33,7 @@ from node_runtime.command_line import (
     say,
     whole_number,
 )
-from policy_node.policies.files import to_csv, to_json
+from policy_node.policies.files import require_writable, to_csv, to_json
 from policy_node.policies.policy import LoadedPolicy
 from policy_node.training.evaluation import (
     FIRST_SEED,
@@ -46,7 +46,6 @@ from policy_node.training.policy_options import (
     load_chosen_policy,
     make_chosen_simulation,
     policy_errors,
-    require_writable,
     write_result,
 )
 from policy_node.training.robustness.figure import draw
@@ -85,6 +84,8 @@ def _run(options: argparse.Namespace) -> int:
     loaded = load_chosen_policy(options)
     simulation = make_chosen_simulation(options, loaded)
     name = options.output or Path(f'{loaded.task}.robustness')
+    if not name.name:
+        raise UsageError(f'--output {name}; allowed: the path of a file')
     files = {kind: name.with_name(f'{name.name}.{kind}') for kind in ('json', 'csv', 'png')}
     for file in files.values():
         require_writable(file)

@@ -12,10 +12,9 @@ from fetch_hand_sim.simulation import Simulation
 from node_runtime.signals import discard_unread_output
 from policy_node.policies import checkpoint
 from policy_node.policies.checkpoint import ActorInfo
-from policy_node.policies.files import sha256, to_json, write_files
+from policy_node.policies.files import require_writable, sha256, to_json, write_files
 from policy_node.policies.loading import ROBUST, shipped_name
 from policy_node.training.evaluation import FIRST_SEED, evaluate, print_table, summarize
-from policy_node.training.policy_options import require_writable
 from policy_node.training.runs.run_folder import (
     BEST_FILE,
     COMMAND_FILE,

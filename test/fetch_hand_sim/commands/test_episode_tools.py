@@ -310,7 +310,9 @@ def test_list_takes_one_file_or_bag_like_the_other_commands(reach, tmp_path, cap
     assert f'skipped {tmp_path} holds 0 MCAP files' in capsys.readouterr().err
 
 
-def test_list_calls_episodes_as_their_folders_and_names_those_below(reach, tmp_path, capsys):
+def test_list_calls_episodes_as_their_folders_and_names_those_below(
+    reach, tmp_path, capsys, monkeypatch
+):
     name = f'FetchReach_{0:06d}_seed11'
     for copy in ('kept', 'kept too'):
         shutil.copytree(reach / name, tmp_path / 'day 1' / copy)
@@ -320,6 +322,13 @@ def test_list_calls_episodes_as_their_folders_and_names_those_below(reach, tmp_p
     assert episodes_list.main([str(tmp_path)]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[-1] == f'episodes are in {tmp_path / "day 1"}'
+    monkeypatch.chdir(tmp_path / 'day 1' / 'kept')
+    assert episodes_list.main(['.']) == 0
+    assert capsys.readouterr().out.splitlines()[1].startswith('kept ')
+    cut = cut_off(reach / name, tmp_path, 2000)
+    monkeypatch.chdir(cut)
+    assert episodes_list.main(['.']) == 1
+    assert f'`fetch_hand_sim episodes recover {tmp_path}` ends it' in capsys.readouterr().err
 
 
 def test_a_narrow_terminal_wraps_names_and_numbers_instead_of_cutting_them(

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fetch_hand_sim.episode_log import EpisodeWriter
+from fetch_hand_sim.episode_log import EpisodeLogError, EpisodeWriter
 from fetch_hand_sim.episode_log.arrays import load_episode
 from fetch_hand_sim.episodes.generator import EpisodeGenerator
 from fetch_hand_sim.episodes.recorder import RecordingContext
@@ -63,8 +63,27 @@ def test_ctrl_c_while_a_file_is_written_leaves_whole_ones_alone(
     assert len(logged) == 1 and logged == list(tmp_path.iterdir())
 
 
+def test_a_full_disk_reports_every_finished_episode(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    written, store = itertools.count(), EpisodeWriter.store
+
+    def full(self: EpisodeWriter) -> Path | None:
+        if next(written) == 0:
+            raise EpisodeLogError('no space left')
+        return store(self)
+
+    monkeypatch.setattr(EpisodeWriter, 'store', full)
+    logged = []
+    with pytest.raises(EpisodeLogError, match='no space left'):
+        for each in generator(tmp_path, rest).generate(ROBOTS):
+            logged.append(each.path)
+    assert len(logged) == ROBOTS - 1
+    assert {*logged} == {path for path in tmp_path.iterdir() if path.name[0] != '.'}
+
+
 def test_an_episode_that_mujoco_gave_up_is_no_whole_one(tmp_path: Path) -> None:
-    """Its last tick is of the state that MuJoCo was set back to."""
+    """Its last tick is of the state that MuJoCo was set back to, so loading leaves it out."""
     simulation = Simulation('FetchReach', num_envs=ROBOTS, num_threads=1)
     velocity, asked = simulation.task.batch.bind('qvel'), itertools.count(1)
 
@@ -77,4 +96,5 @@ def test_an_episode_that_mujoco_gave_up_is_no_whole_one(tmp_path: Path) -> None:
     assert whole.is_complete and not lost.is_complete
     outcomes = [load_episode(each.path) for each in (whole, lost)]
     assert [each.outcome.reason for each in outcomes] == [None, 'diverged']
-    assert [(each.is_complete, len(each)) for each in outcomes] == [(True, 50), (False, 5)]
+    assert [(each.is_complete, len(each)) for each in outcomes] == [(True, 50), (False, 4)]
+    assert [each.outcome.steps for each in outcomes] == [50, 5]

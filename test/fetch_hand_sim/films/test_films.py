@@ -312,7 +312,7 @@ def test_without_opengl_there_is_one_line(folder, tmp_path, monkeypatch, capsys)
 
 
 def test_a_film_in_memory_gives_back_every_picture_and_plays_in_a_notebook(tmp_path):
-    film = Film(PICTURES, fps=25.0)
+    film = Film(PICTURES, fps=np.float32(25.0))
     assert len(film) == 5
     assert [picture.tolist() for picture in film] == [picture.tolist() for picture in PICTURES]
     assert repr(film) == 'Film(5 pictures of 7x5, 0.2 s)'
@@ -323,6 +323,7 @@ def test_a_film_in_memory_gives_back_every_picture_and_plays_in_a_notebook(tmp_p
     for name in ('film.gif', 'film.webp'):
         with Image.open(film.save(tmp_path / name)) as image:
             assert image.n_frames == 5
+    assert film.save(tmp_path / 'film.mp4').is_file()
 
 
 @pytest.mark.parametrize(

@@ -117,6 +117,11 @@ def send_three_values(case):
         case.robot.buffer.accept([1.0] * 3)
 
 
+def send_three_values_and_four(case):
+    send_three_values(case)
+    case.robot.buffer.accept([0.0] * 4)
+
+
 def diverge(case):
     case.robot.runner.simulation.divergences += 1
 
@@ -130,6 +135,7 @@ ELSEWHERE = {'commanders': [], 'waiting': ['/policy_node waits for a robot on /e
         (miss_ticks, {}, '3 ticks missed'),
         (answer_once, {}, '2 late commands: not the answer to the last observation'),
         (send_three_values, {}, '1 commands rejected; 3 values given; allowed: 4'),
+        (send_three_values_and_four, {}, '1 commands rejected; 3 values given; allowed: 4'),
         (
             answer_far_out,
             {},

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -83,6 +84,23 @@ def test_a_robot_that_comes_back_with_other_joint_names_is_followed(node, every_
         act_until(node, tick, is_shown)
         assert watch.joint_prefix == prefix
         robot.leave()
+
+
+def test_a_robot_without_some_joints_and_success_is_shown(node, monkeypatch):
+    seen, robot = [], Robot(node)
+    watch, advance = RobotWatch(node, lambda status: None, seen.append), robot._runner.advance
+
+    def without_base(command):
+        tick = advance(command)
+        joints = np.concatenate([np.full(3, np.nan), tick.readings['joint_states'][3:]])
+        return replace(tick, readings={**tick.readings, 'joint_states': joints})
+
+    monkeypatch.setattr(robot._runner, 'advance', without_base)
+    act_until(node, lambda: robot.tick(lost=('is_success',)), lambda: seen)
+    assert watch.joint_prefix == JOINT_PREFIX
+    assert not seen[0].frame.is_success
+    assert seen[0].frame.joint_position[:3].tolist() == [0.0] * 3
+    assert np.isfinite(seen[0].frame.joint_position).all()
 
 
 def test_a_tick_that_lost_its_first_message_does_not_pass_for_the_one_before(node):

@@ -61,6 +61,7 @@ def test_a_folder_without_episodes_or_with_one_of_an_unknown_task(capsys, tmp_pa
         (['x', '--episode-dir', 'y', '--task', 'FetchPush'], 'a file and --task and --epi', ''),
         (['--policy', 'x', '--wait', '0'], '--policy: only together with --task', ''),
         (['--episode-dir', 'x', '--wait', '0'], '--episode-dir: only together with --task', ''),
+        (['--trust', '--wait', '0'], '--trust: only together with --task', ''),
         (['--wait=nan'], '--wait nan; allowed: 0 and more', ''),
         (['--port', '99999'], '--port 99999; allowed: 0 ... 65535', ''),
         (['--task', 'fetchpush'], '', "; did you mean 'FetchPush'?"),

@@ -42,7 +42,7 @@ def episode():
     runner = EpisodeRunner(Simulation('FetchReach', num_threads=1))
     encoder = TickEncoder(REACH)
     status = runner.waiting_status()
-    ticks = [encoder.encode(runner.advance(np.full(4, 0.1))) for _ in range(5)]
+    ticks = [encoder.encode(runner.advance(np.full(4, 0.1))) for _ in range(6)]
     return status, [{spec.name: data for spec, data in messages} for messages in ticks]
 
 
@@ -109,7 +109,9 @@ def test_a_command_without_a_subscriber_is_sent_once_later(case):
 def test_invalid_state_is_refused_and_the_next_tick_answered(case):
     """Values that no observation needs may be missing, for example efforts."""
     responder, wire, ticks = case
-    pose, joints = topic(REACH, 'end_effector_pose'), topic(REACH, 'joint_states')
+    pose, joints, goal = (
+        topic(REACH, name) for name in ('end_effector_pose', 'joint_states', 'desired_goal')
+    )
 
     def changed(tick, source, values):
         stamp, vector = TopicCodec(source).decode(tick[source.name])
@@ -132,11 +134,13 @@ def test_invalid_state_is_refused_and_the_next_tick_answered(case):
             changed(ticks[3], joints, {len(joints.names) - 1: math.inf}),
             f'joint_states: no finite position of {joints.names[-1]}$',
         ),
+        # No observation reads the joints of the base.
+        (changed(changed(ticks[4], joints, {0: math.nan}), goal, {0: math.nan}), 'desired_goal'),
     ):
         with pytest.raises(ValueError, match=line):
             feed(responder, bad)
-    feed(responder, in_frame(ticks[4], ''))
-    assert (responder.unusable, len(wire.sent)) == (3, 2)
+    feed(responder, in_frame(ticks[5], ''))
+    assert (responder.unusable, len(wire.sent)) == (4, 2)
 
 
 def test_hostile_bytes_are_refused_in_one_line_and_counted(case, hostile_count):

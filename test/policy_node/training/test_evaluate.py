@@ -220,6 +220,8 @@ def test_an_actor_is_evaluated_at_the_rate_it_was_trained_at(tmp_path):
         # Before the episodes.
         (['--policy', 'FetchReach', '--json', '/dev/null/a.json'], 'a.json cannot be written'),
         (['--policy', 'FetchReach', '--csv', '/dev'], '/dev cannot be written'),
+        (['--policy', 'FetchReach', '--csv', 'a' * 300], 'cannot be written: File name too long'),
+        (['--policy', f'{"a" * 300}:make', '--task', 'FetchReach'], 'add --trust'),
         (['--policy', 'FetchReach', '--against', 'FetchPush'], '--against: '),
     ],
 )

@@ -38,6 +38,11 @@ def test_the_sentence_names_what_is_kept_and_what_is_lost():
     assert 'up to 80 ms action latency, ' in text and 'not with 0.005 rad joint noise.' in text
 
 
+def test_an_output_without_a_name_is_refused(capsys):
+    assert main([*FEW, '--output', '.']) == 2
+    assert '--output .; allowed: the path of a file' in capsys.readouterr().err
+
+
 @pytest.mark.release
 def test_an_interrupted_command_goes_on_with_the_missing_points(tmp_path, capsys):
     words, file = [*FEW, '--output', str(tmp_path / 'a.b')], tmp_path / 'a.b.json'
