@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from fetch_hand_sim.gym_envs.pictures import RENDER_MODES, Image
 from fetch_hand_sim.gym_envs.task_attributes import TaskAttributes, clip_actions
 from fetch_hand_sim.simulation import Observation, Simulation
-from fetch_hand_sim.simulation.arguments import goals_to_set
+from fetch_hand_sim.simulation.arguments import finite_numbers
 from fetch_hand_sim.simulation.models import compiled_bytes
 from msgs_spec.arrays import Array
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ
@@ -159,8 +159,10 @@ class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32
 
     @goal.setter
     def goal(self, goal: ArrayLike) -> None:
-        # A new array: references to the old one keep their values.
-        self.simulation.goals = goals_to_set(self.spec_of_task, goal)[None]
+        size = (self.spec_of_task.goal.size,)
+        given = finite_numbers(f'goal of {self.spec_of_task.name}', goal, size)
+        # References to the old array keep their values.
+        self.simulation.goals = given[None].copy()
 
     def render(self) -> Image | None:
         """Render a picture of the robot and its goal.

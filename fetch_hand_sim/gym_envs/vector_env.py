@@ -16,7 +16,7 @@ from fetch_hand_sim.episodes.runner import has_ended
 from fetch_hand_sim.gym_envs.pictures import RENDER_MODES
 from fetch_hand_sim.gym_envs.task_attributes import TaskAttributes, clip_actions
 from fetch_hand_sim.simulation import Observation, StepResult
-from fetch_hand_sim.simulation.arguments import goals_to_set, require_whole
+from fetch_hand_sim.simulation.arguments import finite_numbers, require_whole
 from msgs_spec.arrays import Array, Flags
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ
 from msgs_spec.text import one_line, one_of
@@ -310,7 +310,10 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
         if len(each) != self.num_envs:
             raise ValueError(f'{self.num_envs} environments take as many values, not {len(each)}')
         if name == 'goal':
-            self.simulation.goals[:] = goals_to_set(self.spec_of_task, each, self.num_envs)
+            shape = (self.num_envs, self.spec_of_task.goal.size)
+            self.simulation.goals[:] = finite_numbers(
+                f'goals of {self.spec_of_task.name}', each, shape
+            )
         elif name not in _SETTABLE:
             allowed = ', '.join(('goal', *_SETTABLE))
             raise AttributeError(f'{name!r} of a batch cannot be set; allowed: {allowed}')

@@ -15,7 +15,6 @@ from numpy.typing import ArrayLike, NDArray
 from fetch_hand_sim.simulation.tasks import Task
 from msgs_spec.arrays import Array
 from msgs_spec.rotations import quaternion_to_matrix
-from msgs_spec.tasks import GoalKind, TaskSpec
 from msgs_spec.text import entries, one_line
 
 Seed = int | np.random.Generator | None
@@ -58,28 +57,12 @@ def nearest_quaternions(goals: Array, achieved_goals: Array) -> Array:
 
     Of q and -q, the same rotation, the nearer one is taken. A zero quaternion raises ValueError.
     """
-    quaternions = goals[:, 3:] / _quaternion_norms(goals)
+    norm = np.linalg.norm(goals[:, 3:], axis=1, keepdims=True)
+    if not (norm > 1e-6).all():
+        raise ValueError('a goal quaternion must not be zero')
+    quaternions = goals[:, 3:] / norm
     quaternions[(quaternions * achieved_goals[:, 3:]).sum(axis=1) < 0.0] *= -1.0
     return np.concatenate([goals[:, :3], quaternions], axis=1)
-
-
-def goals_to_set(spec: TaskSpec, goals: ArrayLike, *leading: int) -> NDArray[np.floating]:
-    """Return goals of a task as a new array (*leading, goal size), or raise ValueError.
-
-    Quaternions are normalised; those of length 1 keep their bits.
-    """
-    given = finite_numbers(f'goal of {spec.name}', goals, (*leading, spec.goal.size)).copy()
-    if spec.goal is GoalKind.POSE:
-        norms = _quaternion_norms(given)
-        given[..., 3:] /= np.where(np.abs(norms - 1.0) < 1e-6, 1.0, norms)
-    return given
-
-
-def _quaternion_norms(goals: NDArray[np.floating]) -> NDArray[np.floating]:
-    norms: NDArray[np.floating] = np.linalg.norm(goals[..., 3:], axis=-1, keepdims=True)
-    if not (norms > 1e-6).all():
-        raise ValueError('a goal quaternion must not be zero')
-    return norms
 
 
 def each_of(name: str, given: Any, count: int) -> list[Any]:

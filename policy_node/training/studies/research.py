@@ -51,8 +51,18 @@ _SLIDE = {
     'actor_average': 0.9,
     'final_exploration': 1.0,
 }
-HAND: dict[str, Any] = {**_LONG, 'total_steps': 1_000_000, 'evaluate_every': 64_000}
-_SCREENED = {'total_steps': 400_000, 'evaluate_every': 64_000, 'evaluation_episodes': 128}
+HAND: dict[str, Any] = {
+    **_LONG,
+    'total_steps': 1_000_000,
+    'evaluate_every': 64_000,
+    'policy_delay': 1,
+}
+_SCREENED = {
+    'total_steps': 400_000,
+    'evaluate_every': 64_000,
+    'evaluation_episodes': 128,
+    'policy_delay': 1,
+}
 # Imagined subgoals, learnt every fourth time.
 _RARE_PRIOR: dict[str, Any] = {'subgoal_prior': 0.3, 'imagination_interval': 4}
 # Sparse rewards; the recipe of the task has dense ones.
