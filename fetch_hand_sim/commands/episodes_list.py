@@ -24,7 +24,7 @@ from fetch_hand_sim.episode_log import (
     find_leftovers,
     read_summary,
 )
-from fetch_hand_sim.episode_log.files import folders_below, read_each
+from fetch_hand_sim.episode_log.files import folders_below, metadata_file, read_each
 from fetch_hand_sim.episode_log.metadata import integer_or_none
 from msgs_spec.text import printable
 from node_runtime.command_line import (
@@ -89,7 +89,7 @@ def _name(file: Path) -> str:
     If the directory has no `metadata.yaml`, return the file name without `_0.mcap`.
     """
     directory = file.absolute().parent
-    is_bag = (directory / 'metadata.yaml').is_file()
+    is_bag = metadata_file(directory).is_file()
     return directory.name if is_bag else file.stem.removesuffix('_0')
 
 

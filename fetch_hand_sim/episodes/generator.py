@@ -165,15 +165,11 @@ class EpisodeGenerator:
 
 
 def _completed(waiting: deque[Future[LoggedEpisode]]) -> Iterator[LoggedEpisode]:
-    """Wait for the results and yield them in order; `waiting` keeps the results after an error."""
+    """Wait for the results and yield them in order; `waiting` keeps those not yet yielded."""
     while waiting:
-        try:
-            logged = waiting[0].result()
-        except EpisodeLogError:
-            waiting.popleft()
-            raise
-        waiting.popleft()
-        yield logged
+        # An interrupted wait leaves the result in `waiting`.
+        waiting[0].exception()
+        yield waiting.popleft().result()
 
 
 def _complete(writer: EpisodeWriter, robot: _Robot) -> LoggedEpisode:

@@ -166,7 +166,7 @@ _HAND_REACH = {
 # A smaller learning rate and less noise after `best`.
 _CAREFUL = {'critic_first': 2_000, 'learning_rate': 3e-4, 'total_steps': 1_200_000}
 # As in the run that took the egg from .940 to .977 (docs/lab_notes/training_log.md).
-_TURNED = _CAREFUL | {
+_CAREFUL_TURNING = _CAREFUL | {
     'learning_starts': 64_000,
     'noise_std': 0.1,
     'random_epsilon': 0.08,
@@ -200,8 +200,8 @@ FINE_TUNED: dict[str, dict[str, Any]] = {
         'evaluate_every': 100_000,
         'evaluation_episodes': 400,
     },
-    'HandManipulateBlockRotateXYZ': _TURNED,
-    'HandManipulateEggRotate': _TURNED,
+    'HandManipulateBlockRotateXYZ': _CAREFUL_TURNING,
+    'HandManipulateEggRotate': _CAREFUL_TURNING,
 }
 # Tasks with an object in the hand that `finetune` continues sooner. Steps of the block take less
 # time with half of the actor's updates.
