@@ -204,11 +204,13 @@ FINE_TUNED: dict[str, dict[str, Any]] = {
     # adapt. Twice the steps gain more, and allow an average of actors over some 640,000 steps.
     'HandManipulateBlockRotateXYZ': _CAREFUL_TURNING
     | {'gamma': 0.95, 'critic_first': 5_000, 'total_steps': 2_400_000, 'actor_average': 0.99},
+    'HandManipulateBlockRotateZ': _CAREFUL_TURNING,
     'HandManipulateEggRotate': _CAREFUL_TURNING,
 }
 # Tasks with an object in the hand that `finetune` continues sooner. Steps of the block take less
 # time with half of the actor's updates.
 _TURNING: dict[str, dict[str, Any]] = {
+    'HandManipulateBlockRotateZ': {'total_steps': 2_000_000, 'policy_delay': 2},
     'HandManipulateBlockRotateXYZ': {'total_steps': 4_800_000, 'policy_delay': 2},
     'HandManipulateEggRotate': {'total_steps': 3_200_000},
 }

@@ -6,8 +6,8 @@ from msgs_spec.tasks import TASKS, task_spec
 from policy_node.training.configuration.recipes import FINE_TUNED
 from policy_node.training.studies.study import Arm, Start, Study
 
-# Long trainings first. Networks that can turn the block (XYZ) help in every other block task;
-# likewise for egg and pen.
+# Long trainings first. Networks that can turn the block (XYZ) help in harder block tasks; likewise
+# for egg and pen.
 _ORDER = (
     'HandManipulateBlockRotateXYZ',
     'HandManipulateEggRotate',
@@ -25,7 +25,6 @@ _ORDER = (
 )
 _STARTS_FROM = {
     'HandManipulateBlockRotateParallel': 'HandManipulateBlockRotateXYZ',
-    'HandManipulateBlockRotateZ': 'HandManipulateBlockRotateParallel',
     'HandManipulateBlockFull': 'HandManipulateBlockRotateXYZ',
     'HandManipulateEggFull': 'HandManipulateEggRotate',
     'HandManipulatePenFull': 'HandManipulatePenRotate',
