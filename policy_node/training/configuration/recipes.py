@@ -175,6 +175,23 @@ _CAREFUL_TURNING = _CAREFUL | {
     'actor_average': 0.97,
     'evaluation_episodes': 400,
 }
+# Three settings keep the critic from overestimating values: no goals from the future of the
+# transition, a short horizon and rare updates of the actor (docs/lab_notes/training_log.md).
+_HOLDING: dict[str, Any] = {
+    'goals': 'actual=.2,displaced=.4',
+    'reward_grades': '.5,1,1.5',
+    'gamma': 0.95,
+    'learning_rate': 4e-4,
+    'noise_std': 0.1,
+    'random_epsilon': 0.08,
+    'final_exploration': 0.15,
+    'actor_average': 0.97,
+    'policy_delay': 8,
+    'learning_starts': 100_000,
+    'critic_first': 12_000,
+    'total_steps': 4_000_000,
+    'evaluation_episodes': 300,
+}
 # The fields of `finetune` by task. Study `best` trains these tasks in two stages.
 FINE_TUNED: dict[str, dict[str, Any]] = {
     'FetchSlide': _CAREFUL
@@ -200,10 +217,9 @@ FINE_TUNED: dict[str, dict[str, Any]] = {
         'evaluate_every': 100_000,
         'evaluation_episodes': 400,
     },
-    # A shorter horizon teaches to hold (docs/lab_notes/training_log.md); the critic needs time to
-    # adapt. Twice the steps gain more, and allow an average of actors over some 320,000 steps.
-    'HandManipulateBlockRotateXYZ': _CAREFUL_TURNING
-    | {'gamma': 0.95, 'critic_first': 5_000, 'total_steps': 2_400_000, 'actor_average': 0.98},
+    # An average of actors over some 320,000 steps.
+    'HandManipulateBlockRotateXYZ': _HOLDING
+    | {'actor_average': 0.98, 'total_steps': 2_400_000, 'evaluation_episodes': 400},
     'HandManipulateBlockRotateZ': _CAREFUL_TURNING,
     'HandManipulateEggRotate': _CAREFUL_TURNING,
 }
@@ -288,35 +304,16 @@ def _object_in_hand(task: str) -> dict[str, Any]:
 def _finetune(task: str) -> dict[str, Any]:
     """Return the fields of the recipe `finetune`, which trains a shipped policy further.
 
-    For tasks without own fields in `FINE_TUNED`, three settings keep the critic from
-    overestimating values: no goals from the future of the transition, a short horizon and rare
-    updates of the actor (docs/lab_notes/training_log.md).
-
     Raises:
         ValueError: If the task is neither FetchSlide nor a task of the hand.
     """
+    values = _best(task) | {'init_from': task}
     if task in FINE_TUNED:
-        return _best(task) | FINE_TUNED[task] | {'init_from': task}
+        return values | FINE_TUNED[task]
     if not task.startswith('HandManipulate'):
         allowed = 'FetchSlide and the tasks of the hand'
         raise ValueError(f'recipe finetune for {task}; allowed: {allowed}')
-    values = _best(task) | {
-        'init_from': task,
-        'goals': 'actual=.2,displaced=.4',
-        'reward_grades': '.5,1,1.5',
-        'gamma': 0.95,
-        'learning_rate': 4e-4,
-        'noise_std': 0.1,
-        'random_epsilon': 0.08,
-        'final_exploration': 0.15,
-        'actor_average': 0.97,
-        'policy_delay': 8,
-        'learning_starts': 100_000,
-        'critic_first': 12_000,
-        'total_steps': 4_000_000,
-        'evaluation_episodes': 300,
-    }
-    values |= _shipped_networks(task)
+    values |= _HOLDING | _shipped_networks(task)
     if 'Pen' in task:
         coarser = {'reward_grades': '.5,1,1.5,2.5'}
         values |= {'ticks_after_drop': 3, 'drop_is_lost': True} | coarser
