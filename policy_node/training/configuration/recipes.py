@@ -217,10 +217,14 @@ FINE_TUNED: dict[str, dict[str, Any]] = {
         'evaluate_every': 100_000,
         'evaluation_episodes': 400,
     },
-    # A shorter horizon teaches to hold (docs/lab_notes/training_log.md); the critic needs time to
-    # adapt. Actors are averaged over some 320,000 steps.
-    'HandManipulateBlockRotateXYZ': _CAREFUL_TURNING
-    | {'gamma': 0.95, 'critic_first': 5_000, 'total_steps': 1_600_000, 'actor_average': 0.98},
+    # Actors are averaged over some 320,000 steps.
+    'HandManipulateBlockRotateXYZ': _HOLDING
+    | {
+        'critic_first': 5_000,
+        'actor_average': 0.98,
+        'total_steps': 1_600_000,
+        'evaluation_episodes': 400,
+    },
     'HandManipulateBlockRotateZ': _CAREFUL_TURNING,
     'HandManipulateEggRotate': _CAREFUL_TURNING,
 }
