@@ -161,6 +161,9 @@ class Learner:
     actor_average: Below1 = 0.0
     """Share of an average of actor weights kept each cycle. The average is evaluated and saved. 0
     evaluates the actor itself."""
+    start_share: Below1 = 0.0
+    """Share of the weights from `init_from` in the evaluated and saved actor; it keeps part of what
+    they did (WiSE-FT, arXiv 2109.01903). The training does not change."""
     gamma: Below1 = 0.98
     """Discount. Targets are clipped to [-1/(1-gamma), 0], as in the paper's code, with dense
     rewards too, although these lie below -1 far from the goal."""
@@ -463,6 +466,11 @@ NEEDS: tuple[tuple[str, str, Callable[[Any], bool]], ...] = (
         'n_step longest_hold condition goal_choice ticks_after_drop parameter_noise',
         'algorithm ddpg and no subgoal_every',
         lambda c: c.algorithm == 'ddpg' and not c.subgoal_every,
+    ),
+    (
+        'start_share',
+        'init_from and no subgoal_every',
+        lambda c: bool(c.init_from) and not c.subgoal_every,
     ),
     (
         'importance',

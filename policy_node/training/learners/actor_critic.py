@@ -36,7 +36,8 @@ class ActorCritic:
     """Base class of learners: an actor, its critic and their optimizers.
 
     A subclass implements `update`. `average_actor` is a running average of the actor's weights,
-    which is evaluated and saved.
+    which is evaluated and saved. With `start_share`, that is a weighted mean of it and
+    `start_actor`, the actor from `init_from`.
 
     Args:
         workers: Processes that train together; gradients are averaged over them.
@@ -59,6 +60,7 @@ class ActorCritic:
         self.critic_parameters = list(self.critic.parameters())
         workers.broadcast([*self.actor_parameters, *self.critic_parameters])
         self.average_actor = copy.deepcopy(self.actor.network)
+        self.start_actor = copy.deepcopy(self.actor.network) if config.start_share else None
         self.actor_optimizer = self._adam(self.actor_parameters)
         self.critic_optimizer = self._adam(self.critic_parameters)
         self.critic_first = config.critic_first
@@ -95,9 +97,16 @@ class ActorCritic:
         """
         return self.plain(self.actor.network)
 
+    @torch.no_grad()
     def evaluation_actor(self) -> Actor:
         """Return the actor to evaluate and save, on the CPU, with averaged weights."""
-        return self.plain(self.average_actor)
+        network = self.average_actor
+        if self.start_actor is not None:
+            network = copy.deepcopy(network)
+            pairs = zip(network.parameters(), self.start_actor.parameters(), strict=True)
+            for weight, start in pairs:
+                weight.lerp_(start, self.config.start_share)
+        return self.plain(network)
 
     def other_policies(self) -> dict[str, Policy]:
         """Return more policies to evaluate, by column of `progress.csv`; {} unless overridden."""
@@ -111,7 +120,9 @@ class ActorCritic:
 
     def modules(self) -> dict[str, nn.Module]:
         """Return the modules to save in the training state, by name."""
-        return {'actor': self.actor, 'critic': self.critic, 'average_actor': self.average_actor}
+        start = {} if self.start_actor is None else {'start_actor': self.start_actor}
+        averaged = {'average_actor': self.average_actor}
+        return {'actor': self.actor, 'critic': self.critic, **averaged, **start}
 
     def optimizers(self) -> dict[str, torch.optim.Adam]:
         """Return the optimizers to save in the training state, by name."""

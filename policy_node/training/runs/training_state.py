@@ -241,8 +241,9 @@ def fitting(source: object) -> Iterator[None]:
 def load_networks(tensors: dict[str, Tensor], modules: dict[str, nn.Module]) -> None:
     """Load `tensors` into `modules`, the networks and normalizer statistics by name.
 
-    Missing target networks and a missing averaged actor become copies of actor and critic. A
-    missing critic, or other module except actors and statistics, keeps its weights.
+    Missing target networks and a missing averaged actor become copies of actor and critic, a
+    missing start actor a copy of the averaged actor. A missing critic, or other module except
+    actors and statistics, keeps its weights.
 
     Raises:
         RuntimeError: If sizes do not fit, if an actor or statistics are missing, or if some
@@ -265,13 +266,14 @@ def part_of(tensors: dict[str, Tensor], part: str) -> dict[str, Tensor]:
 
 
 def _with_copies(tensors: dict[str, Tensor], modules: Iterable[str]) -> dict[str, Tensor]:
-    """Return `tensors`, with copies of actor and critic for missing target and averaged networks.
+    """Return `tensors`, with copies of actor and critic for missing target and other networks.
 
     `modules` are the names of the networks and statistics that a run needs.
     """
     sources = {
         'target_actor': 'actor.network',
         'average_actor': 'actor.network',
+        'start_actor': 'average_actor' if part_of(tensors, 'average_actor') else 'actor.network',
         'target_critic': 'critic',
     }
     copies = {

@@ -71,6 +71,22 @@ def test_a_run_starts_with_all_networks_of_another(tmp_path, block_run):
     assert source.learner.critic_optimizer.state_dict()['state'] != {}
 
 
+def test_the_evaluated_actor_keeps_a_share_of_its_start(tmp_path, block_run):
+    config = tiny(BLOCK, init_from=str(block_run), start_share=0.25, learning_rate=0.01)
+    trainer = start(tmp_path, config, read_initial_networks(str(block_run)))
+    first = {k: v.clone() for k, v in trainer.learner.average_actor.state_dict().items()}
+    trainer.train()
+    trainer.save()
+    last = trainer.learner.average_actor.state_dict()
+    assert not same(first, last)
+    evaluated = trainer.learner.evaluation_actor().network.state_dict()
+    for name, value in evaluated.items():
+        torch.testing.assert_close(value, 0.25 * first[name] + 0.75 * last[name])
+    resumed = Trainer(config, tmp_path, Workers())
+    resumed.resume(tmp_path / 'training_state.safetensors')
+    assert same(resumed.learner.evaluation_actor().network.state_dict(), evaluated)
+
+
 @pytest.mark.parametrize('features', ['relative', 'symmetric'])
 def test_a_position_that_now_counts_has_no_effect_at_first(tmp_path, block_run, features):
     """EggFull from EggRotate: actor and critic return the same for every goal position."""
