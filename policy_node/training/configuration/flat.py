@@ -45,7 +45,7 @@ RESEARCH = (
     'algorithm subgoal_every trace importance first_value first_action_gain gamble first_distance '
     'first_rotation noise_seconds parameter_noise target discount critics aggregate norm quantiles '
     'n_step correction longest_hold advantage condition widest_threshold goal_choice subgoal_prior '
-    'imagination_interval ticks_after_drop drop_is_lost reward_grades critic_first '
+    'imagination_interval ticks_after_drop drop_is_lost reward_grades critic_first start_share '
     'disturbance_scales'
 ).split()
 # Former and shorter names of options.
