@@ -184,7 +184,7 @@ _HOLDING: dict[str, Any] = {
 }
 # Fewer steps, and actors averaged over some 320,000 of them. Holding is learnt at the expense of
 # reaching, less with a longer horizon and a share of the networks before.
-_TURNING_BLOCK = _HOLDING | {
+_HOLDING_BLOCK = _HOLDING | {
     'critic_first': 5_000,
     'actor_average': 0.98,
     'start_share': 0.4,
@@ -217,8 +217,8 @@ FINE_TUNED: dict[str, dict[str, Any]] = {
         'evaluate_every': 100_000,
         'evaluation_episodes': 400,
     },
-    'HandManipulateBlockRotateZ': _TURNING_BLOCK,
-    'HandManipulateBlockRotateXYZ': _TURNING_BLOCK,
+    'HandManipulateBlockRotateZ': _HOLDING_BLOCK,
+    'HandManipulateBlockRotateXYZ': _HOLDING_BLOCK,
     # As in the run that took the egg from .940 to .977 (docs/lab_notes/training_log.md).
     'HandManipulateEggRotate': _CAREFUL
     | {

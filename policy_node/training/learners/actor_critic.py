@@ -36,8 +36,8 @@ class ActorCritic:
     """Base class of learners: an actor, its critic and their optimizers.
 
     A subclass implements `update`. `average_actor` is a running average of the actor's weights,
-    which is evaluated and saved. With `start_share`, that is a weighted mean of it and
-    `start_actor`, the actor from `init_from`.
+    which is evaluated and saved. With `start_share`, the mean of it and `start_actor`, the actor
+    from `init_from`, is evaluated and saved instead.
 
     Args:
         workers: Processes that train together; gradients are averaged over them.
@@ -100,13 +100,12 @@ class ActorCritic:
     @torch.no_grad()
     def evaluation_actor(self) -> Actor:
         """Return the actor to evaluate and save, on the CPU, with averaged weights."""
-        network = self.average_actor
+        actor = self.plain(self.average_actor)
         if self.start_actor is not None:
-            network = copy.deepcopy(network)
-            pairs = zip(network.parameters(), self.start_actor.parameters(), strict=True)
+            pairs = zip(actor.network.parameters(), self.start_actor.parameters(), strict=True)
             for weight, start in pairs:
-                weight.lerp_(start, self.config.start_share)
-        return self.plain(network)
+                weight.lerp_(start.cpu(), self.config.start_share)
+        return actor
 
     def other_policies(self) -> dict[str, Policy]:
         """Return more policies to evaluate, by column of `progress.csv`; {} unless overridden."""
@@ -121,8 +120,8 @@ class ActorCritic:
     def modules(self) -> dict[str, nn.Module]:
         """Return the modules to save in the training state, by name."""
         start = {} if self.start_actor is None else {'start_actor': self.start_actor}
-        averaged = {'average_actor': self.average_actor}
-        return {'actor': self.actor, 'critic': self.critic, **averaged, **start}
+        own = {'actor': self.actor, 'critic': self.critic, 'average_actor': self.average_actor}
+        return own | start
 
     def optimizers(self) -> dict[str, torch.optim.Adam]:
         """Return the optimizers to save in the training state, by name."""
