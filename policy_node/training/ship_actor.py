@@ -1,4 +1,4 @@
-"""`ship_actor`: copy the best actor of a run into the package if it beats the shipped actor."""
+"""`ship_actor`: copy an actor of a run into the package if it beats the shipped actor."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     add_batch_options(parser, num_envs=100)
     add = parser.add_argument
     add('run', type=Path, help='output folder of fetch_hand_sim train')
-    add('--checkpoint', default='best.safetensors', help='file in the run; default: %(default)s')
+    add('--checkpoint', help='file in the run; default: the better of best and latest actor')
     add('--actors', type=Path, default=ACTORS, help='target folder; default: the package')
     return parser.parse_args(arguments)
 

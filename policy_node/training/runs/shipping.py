@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
@@ -18,6 +19,7 @@ from policy_node.training.evaluation import FIRST_SEED, evaluate, print_table, s
 from policy_node.training.runs.run_folder import (
     BEST_FILE,
     COMMAND_FILE,
+    LATEST_FILE,
     PROGRESS_FILE,
     STATE_FILE,
     companion_file,
@@ -30,6 +32,9 @@ from policy_node.training.runs.training_state import (
     state_bytes,
 )
 
+# Episodes from this seed on choose between two actors of a run. Neither training nor the reported
+# evaluation uses them.
+_CHOOSING_SEED = 1_500_000_000
 # An actor is better by the first of these; equal values are decided by the next.
 _BETTER = ('success_gymnasium', 'mean_return')
 
@@ -41,7 +46,7 @@ def ship(
     episodes: int,
     num_envs: int = 100,
     threads: int = 0,
-    name: str = BEST_FILE,
+    name: str | None = None,
 ) -> bool:
     """Evaluate an actor of a run; copy it with its files if it is better than the shipped one.
 
@@ -50,7 +55,8 @@ def ship(
     the recipe `robust`.
 
     Args:
-        name: File of the actor in `run`.
+        name: File of the actor in `run`. None takes the better of its best and latest actor in
+            `episodes` other episodes.
 
     Returns:
         True if this actor is now the shipped one, also if it was before; else False.
@@ -60,14 +66,16 @@ def ship(
             action frequency or was evaluated on more episodes.
         UsageError: If the folder cannot be written.
     """
-    file = run / name
-    actor, info = checkpoint.load(file)
+    names = [name] if name else [BEST_FILE, LATEST_FILE]
+    # A run without a whole evaluation has no best actor.
+    files = [run / each for each in names if (run / each).is_file()] or [run / names[0]]
+    info = checkpoint.read_info(files[0])
     progress = _read_log(run / PROGRESS_FILE)
     state = read_state(run / STATE_FILE) if (run / STATE_FILE).is_file() else None
     is_robust = info.config.get('recipe') == ROBUST
     target = actors / f'{shipped_name(info.task, ROBUST if is_robust else "")}.safetensors'
     _require_rate(target, info.control_hz)
-    old, digest = _read_evaluation(target.with_suffix('.json')), checkpoint.checkpoint_hash(file)
+    old, digest = _read_evaluation(target.with_suffix('.json')), _hash_of(files)
     if (old.get('run_sha256'), old.get('episodes')) == (digest, episodes):
         print(f'ship_actor: {target} is already this actor')
         return True
@@ -86,6 +94,8 @@ def ship(
         control_hz=info.control_hz,
         disturbances=disturbances,
     )
+    file = _better_file(files, simulation, episodes)
+    actor, info = checkpoint.load(file)
     summary = summarize(evaluate(simulation, actor, episodes, FIRST_SEED))
     # A closed terminal must not stop the copy.
     discard_unread_output()
@@ -102,6 +112,7 @@ def ship(
         'actor': target.stem,
         'sha256': sha256(shipped),
         'run_sha256': digest,
+        'checkpoint': file.name,
         'env_steps': info.env_steps,
         'command': info.command,
         'init_from': info.init_from,
@@ -112,6 +123,25 @@ def ship(
     _write(target, shipped, report, state, progress, info)
     print(f'ship_actor: {target} is now the actor of {run}')
     return True
+
+
+def _hash_of(files: Sequence[Path]) -> str:
+    """Return the hash of a file, or of the hashes of several."""
+    hashes = [checkpoint.checkpoint_hash(file) for file in files]
+    return hashes[0] if len(files) == 1 else sha256(''.join(hashes).encode())
+
+
+def _better_file(files: Sequence[Path], simulation: Simulation, episodes: int) -> Path:
+    """Return the file of the best actor in `episodes` episodes that only choose; print them."""
+    if len(files) == 1:
+        return files[0]
+    measures = {}
+    for file in files:
+        actor, _ = checkpoint.load(file)
+        found = summarize(evaluate(simulation, actor, episodes, _CHOOSING_SEED))
+        measures[file] = [found[key] for key in _BETTER]
+        print(f'ship_actor: {file.name} succeeds in {measures[file][0]:.4g} of {episodes} episodes')
+    return max(files, key=measures.__getitem__)
 
 
 def _read_log(log: Path) -> list[dict[str, float]]:

@@ -6,8 +6,9 @@ data, figure and table in docs/research/NAME. Runs that the folder contains are 
 
 `--study best`: the best recipe of every task, one job per core. Some tasks start from the networks
 of another: of a run if `--tasks` contains that task, else of its shipped policy. Some are then
-fine-tuned (variant `finetuned`, recipe `finetune`). Finally evaluates each best actor on fresh
-episodes and copies it with its critic, evaluation and curve into <output>/actors.
+fine-tuned (variant `finetuned`, recipe `finetune`). Finally chooses between the best and the latest
+actor of each run, evaluates it on fresh episodes, and copies the best of each task with its critic,
+evaluation and curve into <output>/actors.
 
 `--study module:NAME`: a `Study` of your own in a Python module of the working directory.
 
@@ -42,7 +43,6 @@ from node_runtime.command_line import (
 from policy_node.policies.files import write_file
 from policy_node.policies.loading import is_python_name, working_directory_first
 from policy_node.training.configuration.flat import whole, with_assignments
-from policy_node.training.runs.run_folder import BEST_FILE
 from policy_node.training.runs.shipping import ship
 from policy_node.training.studies.best import BEST
 from policy_node.training.studies.published import actors_table
@@ -248,16 +248,13 @@ def _place(
 
 
 def _ship_all(options: argparse.Namespace, jobs: Sequence[Job], output: Path, report: Path) -> bool:
-    """Evaluate the best actor of each job; copy it to `--actors` if it beats the actor there.
+    """Evaluate the actors of each job; copy the better one to `--actors` if it beats that there.
 
     Return False if an evaluation or a copy failed. Otherwise write a table of the actors to the
-    folder `report` and return True. Jobs without a best actor are skipped with a message.
+    folder `report` and return True.
     """
     actors, whole = options.actors or output / 'actors', True
     for job in jobs:
-        if not (job.folder / BEST_FILE).is_file():
-            complain(_NAME, f'{job.name} has no best actor: no evaluation was whole')
-            continue
         try:
             ship(job.folder, actors, episodes=options.episodes or 2000)
         except (OSError, ValueError, CommandError) as error:

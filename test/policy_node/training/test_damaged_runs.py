@@ -15,6 +15,7 @@ from safetensors.numpy import load_file, save_file
 from policy_node.policies.files import read_tensors, write_tensors
 from policy_node.policies.loading import shipped_actors
 from policy_node.training.configuration.recipes import recipe_config
+from policy_node.training.evaluation import FIRST_SEED
 from policy_node.training.experience.episode_files import load_replay
 from policy_node.training.experience.replay import EpisodeReplay
 from policy_node.training.machine import available_memory
@@ -23,6 +24,7 @@ from policy_node.training.runs.initial_networks import read_initial_networks
 from policy_node.training.runs.run import Caller, train_run
 from policy_node.training.runs.run_log import read_progress
 from policy_node.training.runs.training_state import read_counters
+from policy_node.training.ship_actor import ACTORS
 from policy_node.training.ship_actor import main as ship_actor
 from policy_node.training.train_her import main
 from support.runs import SMALL, STATE, one_line, options_of, resumed
@@ -234,6 +236,15 @@ def test_an_evaluation_of_fewer_episodes_replaces_no_actor(run, tmp_path, capsys
     assert ship(run, actors, 4) == 0
     assert 'is already this actor' in capsys.readouterr().out
     assert files_in(actors) == before
+
+
+@pytest.mark.parametrize('better', ['best.safetensors', 'latest.safetensors'])
+def test_the_better_of_the_best_and_the_latest_actor_is_shipped(run, tmp_path, better):
+    shutil.copy(ACTORS / 'FetchReach.safetensors', run / better)
+    assert ship(run, tmp_path / 'actors', 4) == 0
+    report = json.loads((tmp_path / 'actors' / 'FetchReach.json').read_text())
+    assert (report['checkpoint'], report['success_gymnasium']) == (better, 1.0)
+    assert report['first_seed'] == FIRST_SEED
 
 
 @pytest.mark.parametrize('content', ['{', '{"episodes": 1}', TEXT])
