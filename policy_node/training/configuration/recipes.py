@@ -218,6 +218,7 @@ FINE_TUNED: dict[str, dict[str, Any]] = {
         'evaluation_episodes': 400,
     },
     'HandManipulateBlockRotateZ': _HOLDING_BLOCK,
+    'HandManipulateBlockRotateParallel': _HOLDING_BLOCK,
     'HandManipulateBlockRotateXYZ': _HOLDING_BLOCK,
     # As in the run that took the egg from .940 to .977 (docs/lab_notes/training_log.md).
     'HandManipulateEggRotate': _CAREFUL
@@ -235,6 +236,7 @@ FINE_TUNED: dict[str, dict[str, Any]] = {
 # time with half of the actor's updates.
 _TURNING: dict[str, dict[str, Any]] = {
     'HandManipulateBlockRotateZ': {'total_steps': 2_000_000, 'policy_delay': 2},
+    'HandManipulateBlockRotateParallel': {'total_steps': 2_000_000, 'policy_delay': 2},
     'HandManipulateBlockRotateXYZ': {'total_steps': 4_800_000, 'policy_delay': 2},
     'HandManipulateEggRotate': {'total_steps': 3_200_000},
 }

@@ -56,10 +56,12 @@ _OVERLAPPING = {'overlap': True, 'precision': 'auto'}
 
 
 def _start(task: str) -> Start:
-    """Return the task whose networks `task` starts from, and the fields to fine-tune them."""
+    """Return the run whose networks `task` starts from, and the fields to fine-tune them."""
     coarse = _COARSE_FIRST if task_spec(task).position_counts else {}
     held = _HELD if 'Pen' in task else {}
-    return Start(_STARTS_FROM[task], {**_FINE_TUNING, **coarse, **held})
+    before = _STARTS_FROM[task]
+    arm = 'finetuned' if before in FINE_TUNED else 'best'
+    return Start(before, {**_FINE_TUNING, **coarse, **held}, arm)
 
 
 BEST = Study(

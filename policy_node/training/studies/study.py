@@ -80,12 +80,14 @@ class Start:
     """Trained networks from which the runs of a task start.
 
     Attributes:
-        task: Task of the study whose run with the same variant and seed trains them.
+        task: Task of the study whose run with the same seed trains them.
         fields: Fields of `TrainConfig` for the runs that start from them.
+        arm: Variant of that run; empty for the variant of the run that starts from them.
     """
 
     task: str
     fields: Mapping[str, Any]
+    arm: str = ''
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,9 +172,9 @@ class Study:
             if key in jobs:
                 return jobs[key]
             before, given = None, {}
-            if start := Start(task, {}) if arm.after else self.starts.get(task):
+            if start := Start(task, {}, arm.after) if arm.after else self.starts.get(task):
                 if start.task in tasks:
-                    before = add(start.task, self.arm(arm.after) if arm.after else arm, seed)
+                    before = add(start.task, self.arm(start.arm) if start.arm else arm, seed)
                 # The name of a task stands for its shipped policy.
                 given = {**start.fields, 'init_from': str(before.folder) if before else start.task}
             config = self._config(task, arm, {**given, **overrides, **arm.changes, 'seed': seed})
