@@ -94,11 +94,11 @@ def ship(
         control_hz=info.control_hz,
         disturbances=disturbances,
     )
+    # A closed terminal must not stop the copy.
+    discard_unread_output()
     file = _better_file(files, simulation, episodes)
     actor, info = checkpoint.load(file)
     summary = summarize(evaluate(simulation, actor, episodes, FIRST_SEED))
-    # A closed terminal must not stop the copy.
-    discard_unread_output()
     print_table({'policy': str(run), 'task': info.task, **summary})
     if old and [summary[key] for key in _BETTER] <= [old[key] for key in _BETTER]:
         print(f'ship_actor: {target} is at least as good; it stays')
