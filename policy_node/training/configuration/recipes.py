@@ -231,6 +231,8 @@ FINE_TUNED: dict[str, dict[str, Any]] = {
         'actor_average': 0.97,
         'evaluation_episodes': 400,
     },
+    'HandManipulateEggFull': _HOLDING
+    | {'actor_average': 0.98, 'total_steps': 2_400_000, 'evaluation_episodes': 400},
 }
 # Tasks with an object in the hand that `finetune` continues sooner. Steps of the block take less
 # time with half of the actor's updates.
@@ -239,6 +241,7 @@ _TURNING: dict[str, dict[str, Any]] = {
     'HandManipulateBlockRotateParallel': {'total_steps': 2_000_000, 'policy_delay': 2},
     'HandManipulateBlockRotateXYZ': {'total_steps': 4_800_000, 'policy_delay': 2},
     'HandManipulateEggRotate': {'total_steps': 3_200_000},
+    'HandManipulateEggFull': {'total_steps': 3_600_000, 'policy_delay': 2},
 }
 _BEST: dict[str, dict[str, Any]] = {
     'FetchReach': _REACH,
