@@ -14,6 +14,7 @@ from msgs_spec.parameters import LARGEST_SEED
 from node_runtime.command_line import (
     EXIT_SUCCESS,
     CommandParser,
+    UsageError,
     progress,
     run_command,
     usage_errors,
@@ -80,6 +81,8 @@ def _run(options: argparse.Namespace) -> int:
         with usage_errors(prefix='--against: '):
             other = load_policy(options.against, loaded.task, trust=options.trust)
             other.require_rate(simulation.control_hz)
+    if options.csv is not None and options.csv == options.json:
+        raise UsageError(f'--json and --csv both name {options.csv}; allowed: two files')
     for file in (options.json, options.csv):
         if file not in (None, _STDOUT):
             require_writable(file)

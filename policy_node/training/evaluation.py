@@ -83,7 +83,9 @@ def wilson_interval(successes: int, episodes: int) -> tuple[float, float]:
     centre = rate + square / (2 * episodes)
     spread = _Z95 * math.sqrt(rate * (1 - rate) / episodes + square / (4 * episodes**2))
     scale = 1 + square / episodes
-    return max(0.0, (centre - spread) / scale), min(1.0, (centre + spread) / scale)
+    # Rounding must not exclude the rate itself.
+    low, high = min(rate, (centre - spread) / scale), max(rate, (centre + spread) / scale)
+    return max(0.0, low), min(1.0, high)
 
 
 def compare(

@@ -49,7 +49,8 @@ AnyTrainer = Trainer | ImitationTrainer
 # Fields that a resumed run cannot change.
 _FIXED = (
     'hidden_sizes layer_norm goal_features algorithm critics quantiles norm advantage condition '
-    'longest_hold subgoal_every init_from seed control_hz reward_type discount gamble'
+    'longest_hold subgoal_every init_from start_share seed control_hz reward_type discount gamble '
+    'past_actions'
 ).split()
 # They end the run after the cycle.
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)

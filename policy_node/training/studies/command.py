@@ -168,9 +168,6 @@ def _overrides(options: argparse.Namespace, study: Study) -> dict[str, Any]:
     for name in overrides:
         if name in decided:
             raise ValueError(f'--set {name} is not possible: jobs differ in it')
-    for name in ('time_limit', 'success_target'):
-        if overrides.get(name):
-            raise ValueError(f'--set {name} is not possible: a job ends when its steps are done')
     return overrides
 
 

@@ -162,15 +162,17 @@ class Study:
         Raises:
             ValueError: If a task or value is not allowed, or if no variant is for these tasks.
         """
-        for task in tasks:
-            if task not in self.settings:
-                raise ValueError(f'--tasks {task}; allowed in {self.name}: {", ".join(self.tasks)}')
+        self._require_tasks(tasks)
         jobs: dict[tuple[str, str, int], Job] = {}
+        begun: set[tuple[str, str, int]] = set()
 
         def add(task: str, arm: Arm, seed: int) -> Job:
             key = task, arm.name, seed
             if key in jobs:
                 return jobs[key]
+            if key in begun:
+                raise ValueError(f'{task}/{arm.name} starts from its own networks')
+            begun.add(key)
             before, given = None, {}
             if start := Start(task, {}, arm.after) if arm.after else self.starts.get(task):
                 if start.task in tasks:
@@ -192,15 +194,23 @@ class Study:
             raise ValueError(f'--tasks {", ".join(tasks)}; allowed with --arms {names}: {allowed}')
         return list(jobs.values())
 
+    def _require_tasks(self, tasks: Sequence[str]) -> None:
+        for task in tasks:
+            if task not in self.settings:
+                raise ValueError(f'--tasks {task}; allowed in {self.name}: {", ".join(self.tasks)}')
+
     def _config(self, task: str, arm: Arm, fields: Mapping[str, Any]) -> TrainConfig:
         """Return the settings of the task with `fields` replaced, at the rate of the run."""
         values = {'recipe': 'best', **REPEATABLE, **self.settings[task], **fields}
         rate = values.get('control_hz', DEFAULT_CONTROL_HZ)
         config = recipe_config(task, **{**values, **steps_at_rate(values, rate)})
+        for name in ('time_limit', 'success_target'):
+            if getattr(config, name):
+                raise ValueError(f'{task}/{arm.name} has {name}; jobs end when steps are done')
         if config.algorithm == 'imitation':
             # Their runs have no training state, so no job of a study would ever be finished.
             raise ValueError(f'{task}/{arm.name} has algorithm imitation; studies cannot run it')
-        factors = {name: to_flat(config)[name] * by for name, by in arm.factors.items()}
+        factors = {name: to_flat(config).get(name, 0) * by for name, by in arm.factors.items()}
         return changed(config, **factors)
 
 

@@ -156,7 +156,7 @@ def test_a_taken_job_and_one_whose_end_was_not_saved_are_finished_later(
         (['--study', 'goals', '--actors', 'x'], '--actors belongs to --study best'),
         (['--set', 'init_from=FetchReach'], '--set init_from is not possible'),
         (['--study', 'unbiased', '--tasks', 'FetchSlide'], 'FetchSlide; allowed in unbiased: F'),
-        (['--set', 'time_limit=2'], '--set time_limit is not possible: a job ends when its steps'),
+        (['--set', 'time_limit=2'], 'FetchReach/her_sparse has time_limit; jobs end when'),
     ],
 )
 def test_bad_usage_is_one_line_and_exit_status_2(

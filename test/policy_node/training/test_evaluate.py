@@ -49,6 +49,12 @@ def test_wilson_interval(successes, episodes, interval):
     assert wilson_interval(successes, episodes) == pytest.approx(interval, abs=5e-5)
 
 
+def test_the_interval_contains_the_rate():
+    for episodes in range(1, 200):
+        assert wilson_interval(0, episodes)[0] == 0.0
+        assert wilson_interval(episodes, episodes)[1] == 1.0
+
+
 def test_an_episode_depends_on_its_seed_alone_and_a_good_policy_succeeds():
     one = evaluate(simulation(1), TowardsGoal(), 6, first_seed=40)
     many = evaluate(simulation(4), TowardsGoal(), 6, first_seed=40)
@@ -220,6 +226,7 @@ def test_an_actor_is_evaluated_at_the_rate_it_was_trained_at(tmp_path):
         # Before the episodes.
         (['--policy', 'FetchReach', '--json', '/dev/null/a.json'], 'a.json cannot be written'),
         (['--policy', 'FetchReach', '--csv', '/dev'], '/dev cannot be written'),
+        (['--policy', 'FetchReach', '--csv', 'a', '--json', 'a'], '--json and --csv both name a;'),
         (['--policy', 'FetchReach', '--csv', 'a' * 300], 'cannot be written: File name too long'),
         (['--policy', f'{"a" * 300}:make', '--task', 'FetchReach'], 'add --trust'),
         (['--policy', 'FetchReach', '--against', 'FetchPush'], '--against: '),

@@ -361,11 +361,21 @@ def test_first_stages_of_another_machine_are_trained_again(tmp_path: Path) -> No
     assert [job.key[1:] for job in _not_stored(jobs, tmp_path)] == [('a', 1), ('b', 1), ('c', 1)]
 
 
-def test_a_study_of_imitations_is_refused_before_it_trains(tmp_path: Path) -> None:
-    arms = (Arm('robust', 'imitation', {'recipe': 'robust'}),)
-    study = Study('robust', None, '?', {'FetchReach': {}}, arms)
-    with pytest.raises(ValueError, match='FetchReach/robust has algorithm imitation; studies'):
-        study.jobs(study.tasks, arms, (0,), {}, tmp_path)
+@pytest.mark.parametrize(
+    ('arm', 'message'),
+    [
+        (Arm('a', 'imitation', {'recipe': 'robust'}), 'FetchReach/a has algorithm imitation'),
+        (Arm('a', 'short', {'time_limit': 1.0}), 'FetchReach/a has time_limit; jobs end when'),
+        (Arm('a', 'circular', after='a'), 'FetchReach/a starts from its own networks'),
+        (Arm('a', 'misspelt', factors={'gama': 2}), "gama; did you mean 'gamma'"),
+    ],
+)
+def test_a_study_that_cannot_finish_is_refused_before_it_trains(
+    tmp_path: Path, arm: Arm, message: str
+) -> None:
+    study = Study('odd', None, '?', {'FetchReach': {}}, (arm,))
+    with pytest.raises(ValueError, match=message):
+        study.jobs(study.tasks, study.arms, (0,), {}, tmp_path)
 
 
 PAGE = ROOT / 'docs' / 'research' / 'studies.md'

@@ -417,6 +417,7 @@ def saved_run(tmp_path_factory):
         (['--output', 'elsewhere'], '--output excludes --resume'),
         (['--set', 'init_from=FetchReach'], "init_from '', which cannot change to 'FetchReach'"),
         (['--quantiles', '5'], 'quantiles 1, which cannot change to 5'),
+        (['--past-actions', '2'], 'past_actions 0, which cannot change to 2'),
         (['--hidden-sizes', '9,9'], 'hidden_sizes (16, 16), which cannot change to (9, 9)'),
         (['--reward-type', 'dense'], "reward_type 'sparse', which cannot change to 'dense'"),
     ],
