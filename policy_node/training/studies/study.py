@@ -104,8 +104,8 @@ class Study:
         seeds: Default number of seeds.
         starts: Networks that the runs of a task start from, by task. If the task that trains them
             is not selected, they are those of its shipped policy.
-        ships: Whether the study selects actors to ship, instead of comparing variants. The best
-            actor of each run is evaluated, and copied if it beats the shipped one.
+        ships: Whether the study selects actors to ship, instead of comparing variants. The better
+            of best and latest actor of each run is copied if it beats the shipped one.
     """
 
     name: str
@@ -195,6 +195,7 @@ class Study:
         return list(jobs.values())
 
     def _require_tasks(self, tasks: Sequence[str]) -> None:
+        """Raise ValueError if the study has no settings for a task."""
         for task in tasks:
             if task not in self.settings:
                 raise ValueError(f'--tasks {task}; allowed in {self.name}: {", ".join(self.tasks)}')
