@@ -13,7 +13,7 @@ from fetch_hand_sim.simulation import Simulation
 from node_runtime.signals import discard_unread_output
 from policy_node.policies import checkpoint
 from policy_node.policies.checkpoint import ActorInfo
-from policy_node.policies.files import require_writable, sha256, to_json, write_files
+from policy_node.policies.files import read_file, require_writable, sha256, to_json, write_files
 from policy_node.policies.loading import ROBUST, shipped_name
 from policy_node.training.evaluation import FIRST_SEED, evaluate, print_table, summarize
 from policy_node.training.runs.run_folder import (
@@ -75,7 +75,8 @@ def ship(
     is_robust = info.config.get('recipe') == ROBUST
     target = actors / f'{shipped_name(info.task, ROBUST if is_robust else "")}.safetensors'
     _require_rate(target, info.control_hz)
-    old, digest = _read_evaluation(target.with_suffix('.json')), _hash_of(files)
+    old = _read_evaluation(target.with_suffix('.json'))
+    digest = sha256(b''.join(map(read_file, files)))
     if (old.get('run_sha256'), old.get('episodes')) == (digest, episodes):
         print(f'ship_actor: {target} is already this actor')
         return True
@@ -123,12 +124,6 @@ def ship(
     _write(target, shipped, report, state, progress, info)
     print(f'ship_actor: {target} is now the actor of {run}')
     return True
-
-
-def _hash_of(files: Sequence[Path]) -> str:
-    """Return the hash of a file, or of the hashes of several."""
-    hashes = [checkpoint.checkpoint_hash(file) for file in files]
-    return hashes[0] if len(files) == 1 else sha256(''.join(hashes).encode())
 
 
 def _better_file(files: Sequence[Path], simulation: Simulation, episodes: int) -> Path:

@@ -211,6 +211,7 @@ class Study:
         if config.algorithm == 'imitation':
             # Their runs have no training state, so no job of a study would ever be finished.
             raise ValueError(f'{task}/{arm.name} has algorithm imitation; studies cannot run it')
+        # `changed` rejects unknown fields.
         factors = {name: to_flat(config).get(name, 0) * by for name, by in arm.factors.items()}
         return changed(config, **factors)
 

@@ -364,7 +364,10 @@ def test_first_stages_of_another_machine_are_trained_again(tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ('arm', 'message'),
     [
-        (Arm('a', 'imitation', {'recipe': 'robust'}), 'FetchReach/a has algorithm imitation'),
+        (
+            Arm('a', 'imitation', {'recipe': 'robust'}),
+            'FetchReach/a has algorithm imitation; studies',
+        ),
         (Arm('a', 'short', {'time_limit': 1.0}), 'FetchReach/a has time_limit; jobs end when'),
         (Arm('a', 'circular', after='a'), 'FetchReach/a starts from its own networks'),
         (Arm('a', 'misspelt', factors={'gama': 2}), "gama; did you mean 'gamma'"),
