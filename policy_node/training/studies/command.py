@@ -7,8 +7,8 @@ data, figure and table in docs/research/NAME. Runs that the folder contains are 
 `--study best`: the best recipe of every task, one job per core. Some tasks start from the networks
 of another: of a run if `--tasks` contains that task, else of its shipped policy. Some are then
 fine-tuned (variant `finetuned`, recipe `finetune`). Finally chooses between the best and the latest
-actor of each run, evaluates it on fresh episodes, and copies the best of each task with its critic,
-evaluation and curve into <output>/actors.
+actor of each last stage, evaluates it on fresh episodes, and copies the best of each task with its
+critic, evaluation and curve into <output>/actors.
 
 `--study module:NAME`: a `Study` of your own in a Python module of the working directory.
 
@@ -247,11 +247,12 @@ def _place(
 def _ship_all(options: argparse.Namespace, jobs: Sequence[Job], output: Path, report: Path) -> bool:
     """Evaluate the actors of each job; copy the better one to `--actors` if it beats that there.
 
-    Return False if an evaluation or a copy failed. Otherwise write a table of the actors to the
-    folder `report` and return True.
+    Stages that another job of their task continues are left out. Return False if an evaluation or
+    a copy failed. Otherwise write a table of the actors to the folder `report` and return True.
     """
     actors, whole = options.actors or output / 'actors', True
-    for job in jobs:
+    continued = [job.after for job in jobs if job.after and job.after.key[0] == job.key[0]]
+    for job in (job for job in jobs if job not in continued):
         try:
             ship(job.folder, actors, episodes=options.episodes or 2000)
         except (OSError, ValueError, CommandError) as error:

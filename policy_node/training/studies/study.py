@@ -105,7 +105,7 @@ class Study:
         starts: Networks that the runs of a task start from, by task. If the task that trains them
             is not selected, they are those of its shipped policy.
         ships: Whether the study selects actors to ship, instead of comparing variants. The better
-            of best and latest actor of each run is copied if it beats the shipped one.
+            of best and latest actor of each last stage is copied if it beats the shipped one.
     """
 
     name: str

@@ -243,6 +243,16 @@ def test_a_variant_that_continues_another_follows_it(tmp_path: Path) -> None:
         jobs_of('--tasks', 'FetchReach', arms=('finetuned',))
 
 
+def test_only_the_last_stage_is_shipped(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = [*TINY, '--tasks', 'FetchSlide', '--steps', '200', '--episodes', '4']
+    assert main([*arguments, '--jobs', '1', '--output', str(tmp_path)]) == 0
+    assert capsys.readouterr().out.count('best.safetensors succeeds in') == 1
+    report = json.loads((tmp_path / 'actors' / 'FetchSlide.json').read_text())
+    assert steps_behind(report) > 200, 'the steps of the first stage count too'
+
+
 def test_the_status_of_a_job_says_how_far_it_is_and_how_long_it_will_take(tmp_path: Path) -> None:
     (job,) = jobs_of('--tasks', 'FetchPush', '--output', str(tmp_path), '--steps', '1000000')
     name = 'FetchPush/best/seed0'
