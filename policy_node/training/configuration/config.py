@@ -671,57 +671,27 @@ def _rules_of_goals(config: TrainConfig) -> Iterator[tuple[bool, str]]:
     )
 
 
-# Noise of this standard deviation leaves next to nothing of actions in [-1, 1].
-_NOISE_ALONE = 10.0
-# Adam moves a weight by at most about the learning rate; float32 loses smaller sums.
-_NO_CHANGE = 1e-7
-# A value that keeps a larger share of its first value has not moved.
-_KEPT = 0.99
-
-
-def idle_parts(config: TrainConfig, critic_first: int = 0) -> Iterator[str]:
-    """Yield a warning for each part of training that has no effect with these values.
-
-    Examples: the run ends before its first update, or exploration noise replaces all actions.
+def idle_note(config: TrainConfig, critic_first: int = 0) -> str:
+    """Return a warning if the run ends before its first update or that of the actor, else ''.
 
     Args:
         critic_first: Number of first updates in which only the critic of the learner is trained;
             the larger one of this number and `config.critic_first` counts.
     """
     c = config
-    spec = task_spec(c.task, control_hz=c.control_hz)
-    cycle = c.num_envs * spec.episode_ticks
-    cycles = -(-c.total_steps // cycle)
+    cycle = c.num_envs * task_spec(c.task, control_hz=c.control_hz).episode_ticks
     # The replay holds whole episodes, at least those of one cycle.
     start = min(c.learning_starts, max(c.replay_transitions, cycle))
-    updates = max(cycles - max(-(-start // cycle) - 1, 0), 0) * c.updates_per_cycle
-    first = max(c.critic_first, critic_first)
-    if c.learning_rate * updates < _NO_CHANGE:
-        yield (
-            f'nothing will be learnt: {updates} updates with learning_starts '
-            f'{c.learning_starts}, updates_per_cycle {c.updates_per_cycle}, '
-            f'learning_rate {c.learning_rate:g}, total_steps {c.total_steps}'
+    cycles = -(-c.total_steps // cycle) - max(-(-start // cycle) - 1, 0)
+    updates, first = max(cycles, 0) * c.updates_per_cycle, max(c.critic_first, critic_first)
+    if not updates:
+        return (
+            f'nothing will be learnt: total_steps {c.total_steps}, learning_starts '
+            f'{c.learning_starts}, updates_per_cycle {c.updates_per_cycle}'
         )
-    elif -(-first // c.policy_delay) * c.policy_delay >= updates:
-        yield (
+    if -(-first // c.policy_delay) * c.policy_delay >= updates:
+        return (
             f'the actor will not learn: critic_first {first}, policy_delay {c.policy_delay} '
             f'of {updates} updates'
         )
-    elif c.actor_average**cycles > _KEPT:
-        yield (
-            f'the evaluated actor will not move: actor_average {c.actor_average:g} '
-            f'over {cycles} cycles'
-        )
-    moves = updates // c.target_update_interval
-    has_targets = c.algorithm == 'ddpg' and c.target == 'polyak'
-    if has_targets and updates and c.polyak**moves > _KEPT:
-        yield (
-            f'the targets will not move: polyak {c.polyak:g}, target_update_interval '
-            f'{c.target_update_interval} of {updates} updates'
-        )
-    epsilon, spread = (c.final_exploration * each for each in (c.random_epsilon, c.noise_std))
-    if epsilon > _KEPT or spread >= _NOISE_ALONE:
-        yield (
-            f'the policy will not act while it collects: random_epsilon {c.random_epsilon:g}, '
-            f'noise_std {c.noise_std:g}'
-        )
+    return ''

@@ -17,7 +17,7 @@ from msgs_spec.text import one_line
 from node_runtime.command_line import complain, complain_from_handler
 from node_runtime.signals import on_stop_signals
 from node_runtime.source_revision import source_revision
-from policy_node.training.configuration.config import TrainConfig, idle_parts
+from policy_node.training.configuration.config import TrainConfig, idle_note
 from policy_node.training.configuration.flat import config_from_dict, removed_fields
 from policy_node.training.experience.replay import Episodes
 from policy_node.training.machine import (
@@ -261,8 +261,8 @@ def _train(
 def _prepare_folder(trainer: AnyTrainer, output: Path, command: str, resume: bool) -> None:
     """Record the command; before a new run, move files of an earlier run into a subfolder.
 
-    Also warn of settings without effect, for example a run that ends before its first update, and
-    of bfloat16 that the processor only emulates.
+    Also warn of a run that ends before its first update, and of bfloat16 that the processor only
+    emulates.
     """
     if not resume and (note := set_former_run_aside(output)):
         complain(NAME, note)
@@ -270,9 +270,9 @@ def _prepare_folder(trainer: AnyTrainer, output: Path, command: str, resume: boo
         # One line for each part of the run.
         with (output / COMMAND_FILE).open('a' if resume else 'w') as file:
             file.write(command + '\n')
-    first = trainer.learner.critic_first if isinstance(trainer, Trainer) else 0
-    for line in idle_parts(trainer.config, first):
-        complain(NAME, line)
+        first = trainer.learner.critic_first if isinstance(trainer, Trainer) else 0
+        if note := idle_note(trainer.config, first):
+            complain(NAME, note)
     precision, device = trainer.config.precision, trainer.workers.device
     if uses_bfloat16(precision, device) and not uses_bfloat16('auto', device):
         # Measured on a CPU with AVX2: 50 times longer for 1024 x 256 times 256 x 256.

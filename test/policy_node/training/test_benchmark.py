@@ -243,9 +243,7 @@ def test_a_variant_that_continues_another_follows_it(tmp_path: Path) -> None:
         jobs_of('--tasks', 'FetchReach', arms=('finetuned',))
 
 
-def test_only_the_last_stage_is_shipped(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_only_the_last_stage_is_shipped(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = [*TINY, '--tasks', 'FetchSlide', '--steps', '200', '--episodes', '4']
     assert main([*arguments, '--jobs', '1', '--output', str(tmp_path)]) == 0
     assert capsys.readouterr().out.count('best.safetensors succeeds in') == 1
