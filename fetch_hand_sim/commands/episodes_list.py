@@ -128,9 +128,11 @@ def _run(options: argparse.Namespace) -> int:
     else:
         if shown:
             show_table(make_table(shown), _WIDEST)
-        successes = sum(episode.outcome.is_success is True for episode in shown)
-        filtered = len(episodes) - len(shown)
-        print(f'{len(shown)} episodes, {successes} successes; {filtered} filtered')
+        complete = [each.outcome for each in shown if each.outcome.is_complete]
+        successes = sum(outcome.is_success is True for outcome in complete)
+        interrupted, filtered = len(shown) - len(complete), len(episodes) - len(shown)
+        note = f' ({interrupted} interrupted)' if interrupted else ''
+        print(f'{len(shown)} episodes{note}, {successes} successes; {filtered} filtered')
         if not (episodes or errors) and (below := folders_below(options.path)):
             print(f'episodes are in {below}')
     for leftover in leftovers:

@@ -157,6 +157,11 @@ def make_vec(
         vectorization_mode=batch,
         **_with_length(name, arguments),
     )
+    spec = env.unwrapped.spec
+    assert spec is not None
+    # Gymnasium keeps the registered length there, and shows no limit (-1) as None in `make`.
+    length = spec.kwargs.get('max_episode_steps')
+    spec.max_episode_steps = None if length == -1 else length
     for wrapper in chosen:
         env = wrapper(env)
     return env

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from fetch_hand_sim.simulation import Simulation
-from msgs_spec.parameters import LARGEST_SEED
 from node_runtime.command_line import (
     EXIT_SUCCESS,
     CommandParser,
@@ -18,14 +17,12 @@ from node_runtime.command_line import (
     progress,
     run_command,
     usage_errors,
-    whole_number,
 )
 from node_runtime.signals import EXIT_INTERRUPTED
 from policy_node.policies.files import require_writable, to_csv, to_json
 from policy_node.policies.loading import load_policy
 from policy_node.policies.policy import LoadedPolicy
 from policy_node.training.evaluation import (
-    FIRST_SEED,
     EpisodeOutcomes,
     compare,
     evaluate,
@@ -33,6 +30,7 @@ from policy_node.training.evaluation import (
     summarize,
 )
 from policy_node.training.policy_options import (
+    add_first_seed,
     add_policy_options,
     add_simulation_options,
     load_chosen_policy,
@@ -51,8 +49,8 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = CommandParser(prog=_NAME, description=__doc__)
     add_policy_options(parser)
     add_simulation_options(parser, num_envs=100)
-    add, seed = parser.add_argument, whole_number(0, LARGEST_SEED)
-    add('--first-seed', type=seed, default=FIRST_SEED, help=f'default: {FIRST_SEED}')
+    add_first_seed(parser)
+    add = parser.add_argument
     add(
         '--json',
         type=Path,

@@ -14,7 +14,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from msgs_spec.parameters import LARGEST_SEED
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ, task_spec
 from node_runtime.command_line import (
     EXIT_SUCCESS,
@@ -26,8 +25,9 @@ from node_runtime.command_line import (
 )
 from policy_node.policies.files import require_writable, to_json
 from policy_node.policies.policy import Policy
-from policy_node.training.evaluation import FIRST_SEED, wilson_interval
+from policy_node.training.evaluation import wilson_interval
 from policy_node.training.policy_options import (
+    add_first_seed,
     add_policy_options,
     load_chosen_policy,
     policy_errors,
@@ -39,10 +39,9 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     """Parse the command line."""
     parser = CommandParser(prog='evaluate_reference', description=__doc__)
     add_policy_options(parser)
+    add_first_seed(parser)
     add = parser.add_argument
     add('--episodes', type=whole_number(1), default=1000, help='default: 1000')
-    seed = whole_number(0, LARGEST_SEED)
-    add('--first-seed', type=seed, default=FIRST_SEED, help=f'default: {FIRST_SEED}')
     add('--json', type=Path, help='add the result to this JSON file')
     return parser.parse_args(arguments)
 

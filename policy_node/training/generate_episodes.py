@@ -25,15 +25,14 @@ from node_runtime.command_line import (
     EXIT_SUCCESS,
     CommandError,
     CommandParser,
-    UsageError,
     complain,
     progress,
     run_command,
     say,
-    whole_number,
 )
 from policy_node.policies.policy import RandomPolicy
 from policy_node.training.policy_options import (
+    add_first_seed,
     add_policy_options,
     add_simulation_options,
     load_chosen_policy,
@@ -49,9 +48,9 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = CommandParser(prog=_NAME, description=__doc__)
     add_policy_options(parser)
     add_simulation_options(parser, num_envs=64)
-    add, seed = parser.add_argument, whole_number(0, LARGEST_SEED)
+    add_first_seed(parser, 0)
+    add = parser.add_argument
     add('--output', type=Path, required=True, help='directory in which episodes are collected')
-    add('--first-seed', type=seed, default=0, help='episode i has this seed plus i; default: 0')
     add('--compiled-model', action='store_true', help='store the compiled model in every file')
     return parser.parse_args(arguments)
 
@@ -90,9 +89,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(options: argparse.Namespace) -> int:
-    last = options.first_seed + options.episodes - 1
-    if last > LARGEST_SEED:
-        raise UsageError(f'the last seed would be {last}; allowed: 0 ... {LARGEST_SEED}')
     generator, simulation = make_generator(options)
     _warn_of_repeated_seeds(options, simulation.spec.name)
     began, cpu_began = time.perf_counter(), time.process_time()

@@ -8,11 +8,13 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from fetch_hand_sim.simulation import Simulation
+from msgs_spec.parameters import LARGEST_SEED
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ, REWARD_TYPES, SUCCESS_RULES, TASKS
 from node_runtime.command_line import CommandError, UsageError, usage_errors, whole_number
 from policy_node.policies.files import write_file
 from policy_node.policies.loading import POLICY_NAMES, load_policy
 from policy_node.policies.policy import LoadedPolicy, PolicyError
+from policy_node.training.evaluation import FIRST_SEED
 
 
 def add_policy_options(parser: argparse.ArgumentParser) -> None:
@@ -36,11 +38,18 @@ def add_batch_options(parser: argparse.ArgumentParser, num_envs: int, episodes: 
     add('--threads', type=int, default=0, help='simulation threads; default: all cores')
 
 
+def add_first_seed(parser: argparse.ArgumentParser, first_seed: int = FIRST_SEED) -> None:
+    """Add the option `--first-seed` with this default."""
+    meaning = f'episode i has this seed plus i; default: {first_seed}'
+    seed = whole_number(0, LARGEST_SEED)
+    parser.add_argument('--first-seed', type=seed, default=first_seed, help=meaning)
+
+
 def add_simulation_options(parser: argparse.ArgumentParser, num_envs: int) -> None:
     """Add the options of `make_chosen_simulation`: batch, disturbances, success rule and reward."""
     add_batch_options(parser, num_envs)
     add = parser.add_argument
-    presets = 'none, mild, hardware, severe, scaled as in hardware*0.5, or a YAML file'
+    presets = 'none, mild, hardware, severe, scaled as in hardware*0.5, a YAML file or JSON'
     add('--disturbances', default='none', help=f'of the robot: {presets}; default: none')
     rule = 'of rewards and `touched`'
     add('--success-rule', choices=SUCCESS_RULES, default='gymnasium', help=rule)
@@ -54,7 +63,7 @@ def load_chosen_policy(options: argparse.Namespace) -> LoadedPolicy:
         UsageError: If both `--policy` and `--task` are missing, or the policy cannot be loaded.
     """
     if not options.policy and options.task is None:
-        raise UsageError(f'--policy is missing; allowed: {POLICY_NAMES}')
+        raise UsageError('--policy and --task are missing; one of them is needed')
     with usage_errors():
         loaded = load_policy(options.policy, options.task, trust=options.trust)
     return loaded
@@ -73,8 +82,11 @@ def make_chosen_simulation(options: argparse.Namespace, loaded: LoadedPolicy) ->
     """Return the simulations for a policy, with the options of `add_simulation_options`.
 
     Raises:
-        UsageError: If an option does not fit the policy.
+        UsageError: If an option does not fit the policy, or the last seed is too large.
     """
+    last = options.first_seed + options.episodes - 1
+    if last > LARGEST_SEED:
+        raise UsageError(f'the last seed would be {last}; allowed: 0 ... {LARGEST_SEED}')
     with usage_errors():
         simulation = Simulation(
             loaded.task,

@@ -20,7 +20,6 @@ from pathlib import Path
 from typing import Any
 
 from fetch_hand_sim.simulation import Simulation
-from msgs_spec.parameters import LARGEST_SEED
 from msgs_spec.tasks import task_spec
 from node_runtime.command_line import (
     EXIT_SUCCESS,
@@ -36,12 +35,12 @@ from node_runtime.command_line import (
 from policy_node.policies.files import require_writable, to_csv, to_json
 from policy_node.policies.policy import LoadedPolicy
 from policy_node.training.evaluation import (
-    FIRST_SEED,
     evaluate,
     wilson_interval,
 )
 from policy_node.training.policy_options import (
     add_batch_options,
+    add_first_seed,
     add_policy_options,
     load_chosen_policy,
     make_chosen_simulation,
@@ -61,8 +60,8 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = CommandParser(prog=_NAME, description=__doc__)
     add_policy_options(parser)
     add_batch_options(parser, num_envs=100, episodes=200)
-    add, seed = parser.add_argument, whole_number(0, LARGEST_SEED)
-    add('--first-seed', type=seed, default=FIRST_SEED, help=f'default: {FIRST_SEED}')
+    add_first_seed(parser)
+    add = parser.add_argument
     add(
         '--output',
         type=Path,

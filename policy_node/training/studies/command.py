@@ -1,8 +1,8 @@
 """`fetch_hand_sim benchmark`: train whole studies as resumable jobs, on one machine or on Ray.
 
-`--study NAME`: the paper's comparison (`paper`, the default), one of its requests for research, or
-`ingredients`. Trains task x variant x seed, measures each run on fresh episodes, and adds it to
-data, figure and table in docs/research/NAME. Runs that the folder contains are not trained again.
+`--study NAME`: the paper's comparison (`paper`, the default), one of its nine requests for
+research, or `ingredients`. Trains task x variant x seed, measures each run on fresh episodes, and
+adds it to data, figure and table in docs/research/NAME. Runs in this folder are not trained again.
 
 `--study best`: the best recipe of every task, one job per core. Some tasks start from the networks
 of another: of a run if `--tasks` contains that task, else of its shipped policy. Some are then
@@ -86,7 +86,7 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     add('--torch-threads', type=_whole, help='tensor threads of each job')
     add('--set', action='append', default=[], metavar='NAME=VALUE', help='any field of TrainConfig')
     add('--output', type=Path, help='default: runs/research/NAME or runs/best')
-    add('--report', type=Path, help='folder of figure and tables')
+    add('--report', type=Path, help='of figure and tables; default: docs/research/NAME or --output')
     add('--episodes', type=count, help='fresh episodes at the end; default: 500; best: 2000')
     add('--ray', action='store_true', help='independent jobs on Ray (extra: cluster)')
     add('--actors', type=Path, help='folder of actors of study best; default: <output>/actors')

@@ -367,26 +367,29 @@ def test_list_filters(reach, tmp_path, capsys):
         ('x1', 'FetchReach', {'success': 'false'}, 'the reason'),
         # Killed and recovered: its success is unknown.
         ('x2', 'HandReach', {}, 'killed'),
+        ('x3', 'HandReach', {'success': 'true', 'steps': '1', 'return': '-1.0'}, 'SIGINT'),
     ):
         writer = EpisodeWriter(directory, name, {'task': task, 'seed': '1'})
         finish_short(writer, result, reason)
 
     reach_names = [path.name for path in sorted(reach.iterdir())]
     for options, expected in (
-        ('--task HandReach', ['x2']),
+        ('--task HandReach', ['x2', 'x3']),
         ('--task HandReach --failure', []),
-        ('--task HandReach --success', []),
-        ('', [*reach_names, 'x0', 'x1', 'x2']),
+        ('--task HandReach --success', ['x3']),
+        ('', [*reach_names, 'x0', 'x1', 'x2', 'x3']),
         ('--task FetchPush', ['x0']),
-        ('--success', ['x0']),
+        ('--success', ['x0', 'x3']),
         ('--failure', [*reach_names, 'x1']),
         ('--complete', [*reach_names, 'x0']),
-        ('--no-complete', ['x1', 'x2']),
+        ('--no-complete', ['x1', 'x2', 'x3']),
         ('--complete --failure --task FetchReach', reach_names),
     ):
         assert episodes_list.main([str(directory), *options.split()]) == 0
         table = capsys.readouterr().out.splitlines()[1:-1]
         assert [line.split()[0] for line in table] == expected, options
+    assert episodes_list.main([str(directory)]) == 0
+    assert capsys.readouterr().out.endswith('7 episodes (3 interrupted), 1 successes; 0 filtered\n')
 
 
 def test_list_shows_no_control_characters_and_no_long_values_of_a_file(tmp_path, capsys):

@@ -88,6 +88,10 @@ def test_environments_are_truncated_after_the_seconds_of_an_episode():
         (fetch_hand_sim.make(slow.spec), 25),
         (fetch_hand_sim.make(slow.spec, control_hz=25), 50),
         (fetch_hand_sim.make_vec(slow.spec, 2), 25),
+        (fast := fetch_hand_sim.make_vec(name, 2, control_hz=50), 100),
+        (fetch_hand_sim.make_vec(fast.spec), 100),
+        (fetch_hand_sim.make_vec(name, 2, max_episode_steps=3), 3),
+        (fetch_hand_sim.make_vec(name, 2, max_episode_steps=-1), None),
     ):
         assert made.spec.max_episode_steps == ticks
     with pytest.warns(UserWarning, match='latest versioned environment'):

@@ -221,7 +221,7 @@ def test_an_actor_is_evaluated_at_the_rate_it_was_trained_at(tmp_path):
     [
         (['--policy', 'Nobody'], "'Nobody'"),
         (['--policy', 'random'], 'random needs a task'),
-        ([], '--policy is missing'),
+        ([], '--policy and --task are missing'),
         (['--policy', 'FetchReach', '--task', 'FetchPush'], 'FetchReach, not on FetchPush'),
         # Before the episodes.
         (['--policy', 'FetchReach', '--json', '/dev/null/a.json'], 'a.json cannot be written'),
@@ -230,6 +230,10 @@ def test_an_actor_is_evaluated_at_the_rate_it_was_trained_at(tmp_path):
         (['--policy', 'FetchReach', '--csv', 'a' * 300], 'cannot be written: File name too long'),
         (['--policy', f'{"a" * 300}:make', '--task', 'FetchReach'], 'add --trust'),
         (['--policy', 'FetchReach', '--against', 'FetchPush'], '--against: '),
+        (
+            ['--task', 'FetchReach', '--first-seed', str(2**32 - 2)],
+            'the last seed would be 4294968',
+        ),
     ],
 )
 def test_bad_usage_is_one_line_and_exit_status_2(arguments, message, capsys):
