@@ -43,8 +43,8 @@ for spec in topics(TASKS['FetchReach']):
 rclpy.spin(node)
 """
 REACH = task_spec('FetchReach')
-# At half speed, a slow machine may fall 0.8 s behind, ten messages, before one is lost.
-RATE = 0.5
+# A policy skips a tick if it falls 40 ms / RATE behind.
+RATE = 0.15
 ODD_NAMES = ('/a b', '/1st', '/a//b', '/' + 300 * 'x')
 
 
