@@ -81,6 +81,8 @@ def policy_errors() -> Iterator[None]:
 def make_chosen_simulation(options: argparse.Namespace, loaded: LoadedPolicy) -> Simulation:
     """Return the simulations for a policy, with the options of `add_simulation_options`.
 
+    The options also include `--first-seed` (`add_first_seed`).
+
     Raises:
         UsageError: If an option does not fit the policy, or the last seed is too large.
     """
