@@ -38,6 +38,7 @@ from msgs_spec.topics import TopicSpec, ground_truth_topics, relative_name, topi
 _CLOCK = '/clock'
 # Characters of a message definition without comments; the longest of the contract has 1,700.
 _LONGEST_SCHEMA = 8000
+_NO_SCHEMA = Schema('none', '', b'')
 
 
 @dataclass(frozen=True, slots=True)
@@ -216,19 +217,18 @@ def require_contract(metadata: dict[str, str], contents: Contents) -> None:
     namespaces = set()
     for channel in contents.channels.values():
         spec = known.get(relative_name(channel.topic))
-        schema = contents.schemas.get(channel.schema_id)
-        type_name = schema.name if schema else 'none'
-        if spec is None or spec.type_name != type_name:
+        schema = contents.schemas.get(channel.schema_id, _NO_SCHEMA)
+        if spec is None or spec.type_name != schema.name:
             raise ValueError(
-                f'{task.name} has no topic {shown(channel.topic)} of type {shown(type_name)}'
+                f'{task.name} has no topic {shown(channel.topic)} of type {shown(schema.name)}'
             )
-        if (channel.encoding, schema and schema.encoding) != ('cdr', 'ros2msg'):
+        if (channel.encoding, schema.encoding) != ('cdr', 'ros2msg'):
             raise ValueError(
                 f'{channel.topic} has the encodings {shown(channel.encoding)} and '
-                f'{shown(schema.encoding if schema else "")}; allowed: cdr, ros2msg'
+                f'{shown(schema.encoding)}; allowed: cdr, ros2msg'
             )
-        if schema and not _defines(spec.type_name, schema.text):
-            raise ValueError(f'{channel.topic} has another definition of {type_name} than ROS 2')
+        if not _defines(spec.type_name, schema.text):
+            raise ValueError(f'{channel.topic} has another definition of {schema.name} than ROS 2')
         if spec.name.startswith('/') and spec.name != channel.topic:
             raise ValueError(f'topic {shown(channel.topic)}; allowed: {spec.name}')
         if not spec.name.startswith('/'):
