@@ -52,15 +52,12 @@ class ReplaySchedule:
             self.period_ns = round(1e9 / parse_control_hz(episode.metadata))
             _require_names(specs)
         wanted = _wanted(specs, list(topics), with_inputs)
-        self.topics = {name: specs[name] for name in episode.topics if name in wanted}
-        self.messages = sorted(
-            (
-                ReplayMessage(message.log_time_ns, name, message.data)
-                for name in self.topics
-                for message in episode.topics[name].messages
-            ),
-            key=lambda message: message.time_ns,
-        )
+        self.topics = {name: spec for name, spec in specs.items() if name in wanted}
+        self.messages = [
+            ReplayMessage(log_time, name, data)
+            for id, _, log_time, _, data in episode.sorted_messages.rows()
+            if (name := episode.channels[id].topic) in wanted
+        ]
         with one_line_errors(episode.path):
             for message in self.messages:
                 deserialize(self.topics[message.name].type_name, message.data)
