@@ -137,12 +137,14 @@ def folders_below(directory: Path) -> str:
     return first_of([printable(str(path)) for path in held], _LISTED)
 
 
+def _hint(directory: Path) -> str:
+    below = folders_below(directory)
+    return f'; there are some in {below}' if below else ''
+
+
 def holds_no_episode(directory: Path) -> EpisodeReadError:
     """Return an error for a folder without episodes; its text names subfolders that have some."""
-    below = folders_below(directory)
-    return EpisodeReadError(
-        f'{directory} holds no episode{f"; there are some in {below}" if below else ""}'
-    )
+    return EpisodeReadError(f'{directory} holds no episode{_hint(directory)}')
 
 
 def expand_episodes(path: Path | str) -> list[Path]:
@@ -194,7 +196,7 @@ def mcap_file(path: Path) -> Path:
         raise EpisodeReadError(f'{path}: {error.strerror}') from error
     if len(found) != 1:
         raise EpisodeReadError(
-            f'{path} holds {len(found)} MCAP files; an episode is a directory of one'
+            f'{path} holds {len(found)} MCAP files; an episode is a directory of one{_hint(path)}'
         )
     return found[0]
 

@@ -12,8 +12,6 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from std_srvs.srv import SetBool
 
-from fetch_hand_sim.episode_log import EpisodeReadError
-from fetch_hand_sim.episode_log.files import folders_below
 from fetch_hand_sim.replay_node import NODE_NAME
 from fetch_hand_sim.replay_node.schedule import Playhead, ReplayMessage, ReplaySchedule
 from msgs_spec.parameters import REPLAY_NODE
@@ -69,11 +67,7 @@ class ReplayNode(Node):
         if not path:
             raise ValueError('path is missing; allowed: a bag directory or an MCAP file')
         names = [name.strip() for name in self._settings['topics'].split(',') if name.strip()]
-        try:
-            return ReplaySchedule(Path(path), names, self._settings['inputs'])
-        except (EpisodeReadError, ValueError) as error:
-            below = folders_below(Path(path))
-            raise ValueError(f'{error}{f"; there are some in {below}" if below else ""}') from None
+        return ReplaySchedule(Path(path), names, self._settings['inputs'])
 
     def _open(self, name: str) -> Publisher:
         spec = self._schedule.topics[name]

@@ -80,6 +80,13 @@ def test_a_killed_recorder_leaves_an_episode_marked_as_unfinished(killed):
         assert_one_line(caught.value)
 
 
+def test_a_folder_of_episodes_is_no_episode_and_the_error_names_those_in_it(killed):
+    directory, _ = killed
+    first, second = find_episodes(directory)
+    with pytest.raises(EpisodeReadError, match=f'; there are some in {first}, {second}$'):
+        read_episode(directory)
+
+
 @pytest.fixture
 def leftover(killed, tmp_path):
     """The unfinished episode in a copy of that directory."""
