@@ -110,7 +110,6 @@ class EpisodeWriter:
         self._rank = 0
         self._received = ReceivedAllowance()
         self._description: str | None = None
-        self._completed: Path | None = None
         try:
             directory.mkdir(parents=True, exist_ok=True)
             files.require_free_space(directory, MINIMUM_FREE_BYTES)
@@ -212,9 +211,9 @@ class EpisodeWriter:
         return True
 
     def store(self) -> Path | None:
-        """Sync and rename the bag; return its directory, or None if `end` has not returned True."""
+        """Sync and rename the bag; return its directory, or None if no bag waits for it."""
         if self._description is None:
-            return self._completed
+            return None
         try:
             files.store(self._stream, self._active, self._description)
             files.publish(self._active, self._final)
@@ -222,8 +221,7 @@ class EpisodeWriter:
             raise self._fail(error) from error
         self._description = None
         self._stop()
-        self._completed = self._final
-        return self._completed
+        return self._final
 
     def discard(self) -> None:
         """Remove the files of an episode that is still being written."""
@@ -266,11 +264,6 @@ def _reason(error: OSError) -> str:
 def episode_name(task: str, index: int, seed: int) -> str:
     """Return `<task>_<index>_seed<seed>`; leading zeros of the index sort names by number."""
     return f'{task}_{index:06d}_seed{seed}'
-
-
-def next_index(directory: Path, task: str) -> int:
-    """Return the index for the next episode of a task: the largest in `directory` plus 1, or 0."""
-    return max((int(name['index']) + 1 for name in _names(directory, task)), default=0)
 
 
 def named_seeds(directory: Path, task: str) -> set[int]:
@@ -319,7 +312,7 @@ class EpisodeDirectory:
 
     def _first_index(self, task: str) -> int:
         try:
-            return next_index(self.path, task)
+            return max((int(name['index']) + 1 for name in _names(self.path, task)), default=0)
         except OSError as error:
             raise EpisodeLogError(
                 f'cannot log episodes in {self.path}: {error.strerror}'
