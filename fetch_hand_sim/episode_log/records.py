@@ -115,11 +115,7 @@ class Fields:
 
     def text(self) -> str:
         """Read a text, stored as its length and UTF-8 bytes."""
-        start = self._position + 4
-        self._position = start + int.from_bytes(self._data[start - 4 : start], 'little')
-        if self._position > len(self._data):
-            raise ValueError(f'damaged: a {self._kind} record is shorter than its fields')
-        return self._data[start : self._position].decode()
+        return self.bytes(self.number(4)).decode()
 
     def strings(self) -> dict[str, str]:
         """Read a map of text to text; ValueError for a repeated key or over `MAX_MAP_ENTRIES`."""
