@@ -12,7 +12,6 @@ from pathlib import Path
 
 from fetch_hand_sim.commands.options import add_filter_options, is_wanted, picture_size
 from fetch_hand_sim.datasets import minari
-from fetch_hand_sim.datasets.parquet import export_parquet
 from fetch_hand_sim.datasets.writing import ByTask, why_apart
 from fetch_hand_sim.episode_log import (
     EpisodeArrays,
@@ -143,6 +142,9 @@ def _why_left_out(episode: EpisodeArrays, others: Sequence[EpisodeArrays], to: s
 def _export(options: argparse.Namespace, by_task: ByTask, name: str) -> dict[str, str]:
     """Write a dataset per task and return its location, text, by task; only Minari uses `name`."""
     if options.to == 'parquet':
+        # Only this format needs pyarrow alone.
+        from fetch_hand_sim.datasets.parquet import export_parquet
+
         files = export_parquet(by_task, options.output)
         return {task: ', '.join(map(str, paths)) for task, paths in files.items()}
     if options.to == 'lerobot':

@@ -14,9 +14,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow
 from numpy.typing import NDArray
+from pyarrow import parquet
 
-from fetch_hand_sim.datasets.writing import ByTask, appearing, require_module
+from fetch_hand_sim.datasets.writing import ByTask, appearing
 from fetch_hand_sim.episode_log import EpisodeArrays
 from fetch_hand_sim.films.film import write_film
 from fetch_hand_sim.films.recording import Studio, recording_of
@@ -52,12 +54,10 @@ def export_lerobot(
         The folder of each dataset by task, for `LeRobotDataset('me/<task>', root=folder)`.
 
     Raises:
-        ExportError: If pyarrow is missing, or a dataset exists or cannot be written. Then no
-            dataset is created.
+        ExportError: If a dataset exists or cannot be written. Then no dataset is created.
         ValueError: If a model has no such camera, or ffmpeg is missing for a film.
         RuntimeError: If there is no OpenGL to draw with.
     """
-    require_module('pyarrow.parquet')
     with appearing(directory, by_task) as hidden:
         for task, episodes in by_task.items():
             rate = episodes[0].record.control_hz
@@ -75,7 +75,6 @@ class _Dataset:
     camera: Camera | None
 
     def write(self, episodes: Sequence[EpisodeArrays]) -> None:
-        pyarrow, parquet = require_module('pyarrow'), require_module('pyarrow.parquet')
         begins = accumulate((len(episode) for episode in episodes), initial=0)
         columns = [
             frames(episode, number, begin)
@@ -194,7 +193,6 @@ def _files(episodes: Sequence[Columns]) -> Iterator[list[Columns]]:
 
 def _column(values: NDArray[Any]) -> Any:
     """Convert an array to an Arrow column of numbers, or of lists of fixed size for (n, size)."""
-    pyarrow = require_module('pyarrow')
     flat = pyarrow.array(values.ravel())
     if values.ndim == 1 or values.shape[1] == 1:
         return flat
@@ -224,7 +222,7 @@ def _tasks(spec: TaskSpec) -> Any:
         ],
         'pandas_version': '2.2.3',
     }
-    table = require_module('pyarrow').table({'task_index': [0], names: [spec.name]})
+    table = pyarrow.table({'task_index': [0], names: [spec.name]})
     return table.replace_schema_metadata({'pandas': json.dumps(pandas)})
 
 

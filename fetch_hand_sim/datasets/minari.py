@@ -18,7 +18,7 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-from fetch_hand_sim.datasets.writing import ByTask, ExportError, appearing, require_module
+from fetch_hand_sim.datasets.writing import ByTask, ExportError, appearing
 from fetch_hand_sim.episode_log import EpisodeArrays
 from fetch_hand_sim.gym_envs.registration import environment_id, register_environments
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ
@@ -58,34 +58,29 @@ def export_minari(by_task: ByTask, directory: Path, name: str) -> dict[str, str]
 
     Raises:
         UsageError: If the name is not allowed.
-        ExportError: If minari is missing, or a dataset exists or cannot be written. Then no
-            dataset is created.
+        ExportError: If a dataset exists or cannot be written. Then no dataset is created.
     """
     versioned = dataset_name(name)
     for task in by_task:
         if not _DATASET_NAME.fullmatch(task):
             raise ExportError(f'Minari takes no dataset of a task that is called {task!r}')
-    minari, collector = require_module('minari'), require_module('minari.data_collector')
     ids = {task: f'{task}/{versioned}' for task in by_task}
     count = sum(map(len, by_task.values()))
     try:
         with _minari_folder(directory, ids.values()), progress('written', count) as advance:
             for task, episodes in by_task.items():
-                buffers = _buffers(collector, episodes, advance)
-                _create_dataset(minari, ids[task], episodes, buffers)
-    except ImportError as error:
-        raise ExportError(f"{error}; install with pip install 'fetch_hand_sim[data]'") from error
+                _create_dataset(ids[task], episodes, advance)
     except (ValueError, AssertionError) as error:
         raise ExportError(f'{directory}: {one_line(error, longest=1000)}') from error
     return ids
 
 
-def _buffers(
-    collector: Any, episodes: Sequence[EpisodeArrays], advance: Callable[[int], None]
-) -> Iterator[Any]:
-    """Yield each episode as an `EpisodeBuffer` of module `collector`; then call `advance(1)`."""
+def _buffers(episodes: Sequence[EpisodeArrays], advance: Callable[[int], None]) -> Iterator[Any]:
+    """Yield each episode as an `EpisodeBuffer` of Minari; then call `advance(1)`."""
+    from minari.data_collector import EpisodeBuffer
+
     for index, episode in enumerate(episodes):
-        yield collector.EpisodeBuffer(
+        yield EpisodeBuffer(
             id=index,
             seed=episode.record.seed,
             observations=dict(episode.observations),
@@ -99,9 +94,11 @@ def _buffers(
 
 
 def _create_dataset(
-    minari: Any, dataset_id: str, episodes: Sequence[EpisodeArrays], buffers: Iterator[Any]
+    dataset_id: str, episodes: Sequence[EpisodeArrays], advance: Callable[[int], None]
 ) -> None:
-    """Write `buffers`, made from `episodes`, as a dataset into the folder MINARI_DATASETS_PATH."""
+    """Write a dataset into the folder MINARI_DATASETS_PATH; call `advance(1)` per episode."""
+    import minari
+
     # Loads MuJoCo, which other exports do not need.
     from fetch_hand_sim.gym_envs.task_attributes import observation_space
 
@@ -111,7 +108,7 @@ def _create_dataset(
     with _unmeasured():
         dataset = minari.create_dataset_from_buffers(
             dataset_id,
-            buffers,
+            _buffers(episodes, advance),
             env=_environment(episodes[0]),
             observation_space=observation_space(spec),
             action_space=actions,
@@ -128,13 +125,14 @@ def _create_dataset(
 @contextmanager
 def _unmeasured() -> Iterator[None]:
     """Stop Minari from adding up all file sizes after every episode, until the block ends."""
-    storage = require_module('minari.dataset.minari_storage').MinariStorage
-    measure = storage.get_size
-    storage.get_size = lambda dataset: 0.0
+    from minari.dataset.minari_storage import MinariStorage
+
+    measure = MinariStorage.get_size
+    MinariStorage.get_size = lambda dataset: 0.0
     try:
         yield
     finally:
-        storage.get_size = measure
+        MinariStorage.get_size = measure
 
 
 @contextmanager

@@ -12,9 +12,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow
 from numpy.typing import NDArray
+from pyarrow import parquet
 
-from fetch_hand_sim.datasets.writing import ByTask, appearing, require_module
+from fetch_hand_sim.datasets.writing import ByTask, appearing
 from fetch_hand_sim.episode_log import EpisodeArrays
 from msgs_spec.text import printable
 
@@ -32,45 +34,43 @@ def export_parquet(by_task: ByTask, directory: Path) -> dict[str, list[Path]]:
     `<task>_episodes.parquet` has a row per episode with its metadata and result.
 
     Raises:
-        ExportError: If pyarrow is missing, or a file exists or cannot be written. Then no file is
-            created.
+        ExportError: If a file exists or cannot be written. Then no file is created.
     """
-    pyarrow, parquet = require_module('pyarrow'), require_module('pyarrow.parquet')
     names = {task: (f'{task}.parquet', f'{task}_episodes.parquet') for task in by_task}
     with appearing(directory, chain(*names.values())) as hidden:
         for task, episodes in by_task.items():
-            for name, table in zip(names[task], _tables(pyarrow, episodes), strict=True):
+            for name, table in zip(names[task], _tables(episodes), strict=True):
                 with (hidden / name).open('wb') as stream:
                     parquet.write_table(table, stream, compression='zstd')
     return {task: [directory / name for name in pair] for task, pair in names.items()}
 
 
-def _tables(pyarrow: Any, episodes: Sequence[EpisodeArrays]) -> tuple[Any, Any]:
+def _tables(episodes: Sequence[EpisodeArrays]) -> tuple[Any, Any]:
     """Return the table of all steps and the table of all episodes of one task."""
-    steps = [_step_table(pyarrow, index, episode) for index, episode in enumerate(episodes)]
+    steps = [_step_table(index, episode) for index, episode in enumerate(episodes)]
     rows = [_episode_row(index, episode) for index, episode in enumerate(episodes)]
     return pyarrow.concat_tables(steps), pyarrow.Table.from_pylist(rows)
 
 
-def _step_table(pyarrow: Any, index: int, episode: EpisodeArrays) -> Any:
+def _step_table(index: int, episode: EpisodeArrays) -> Any:
     rows = len(episode) + 1
     seconds = (episode.stamps - episode.stamps[0]) / 1e9
     columns = {
         'episode_index': pyarrow.array(np.full(rows, index)),
         'step': pyarrow.array(np.arange(rows)),
         'timestamp': pyarrow.array(seconds),
-        **{name: _column(pyarrow, episode.observations[name], rows) for name in _OBSERVATIONS},
-        'action': _column(pyarrow, episode.actions, rows),
-        'command': _column(pyarrow, episode.commands, rows),
-        'reward': _column(pyarrow, episode.rewards, rows),
-        'terminated': _column(pyarrow, episode.terminated, rows),
-        'truncated': _column(pyarrow, episode.truncated, rows),
-        'next_success': _column(pyarrow, episode.success[1:], rows),
+        **{name: _column(episode.observations[name], rows) for name in _OBSERVATIONS},
+        'action': _column(episode.actions, rows),
+        'command': _column(episode.commands, rows),
+        'reward': _column(episode.rewards, rows),
+        'terminated': _column(episode.terminated, rows),
+        'truncated': _column(episode.truncated, rows),
+        'next_success': _column(episode.success[1:], rows),
     }
     return pyarrow.table(columns)
 
 
-def _column(pyarrow: Any, values: NDArray[Any], rows: int) -> Any:
+def _column(values: NDArray[Any], rows: int) -> Any:
     """Convert an array (n,) or (n, size) to an Arrow column, extended with nulls to `rows`."""
     column = pyarrow.array(values.ravel())
     if values.ndim == 2:

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import fcntl
-import importlib
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 from fetch_hand_sim.episode_log import EpisodeArrays
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ
@@ -37,17 +35,6 @@ def why_apart(episode: EpisodeArrays, first: EpisodeArrays) -> str:
         if here != there:
             return f'{name} {here}, and {there} in {first.path}; a dataset has one'
     return ''
-
-
-def require_module(module: str) -> Any:
-    """Import a module of the extra `[data]`, or raise ExportError."""
-    try:
-        return importlib.import_module(module)
-    except ImportError as error:
-        raise ExportError(
-            f'{module.partition(".")[0]} is missing; install it with pip install '
-            "'fetch_hand_sim[data]'"
-        ) from error
 
 
 @contextmanager

@@ -8,8 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fetch_hand_sim.datasets import lerobot
-from fetch_hand_sim.datasets.lerobot import color_statistics
 from fetch_hand_sim.datasets.writing import why_apart
 from fetch_hand_sim.episode_log import EpisodeDirectory, load_episodes
 from fetch_hand_sim.episode_log.arrays import load_episode
@@ -18,6 +16,7 @@ from fetch_hand_sim.simulation.opengl import prepare_opengl
 from support.episode_recorder import Recorder
 
 parquet = pytest.importorskip('pyarrow.parquet')
+lerobot = pytest.importorskip('fetch_hand_sim.datasets.lerobot')
 
 TASK = 'FetchPush'
 DATA, EPISODES = 'data/chunk-000/file-{:03d}.parquet', 'meta/episodes/chunk-000/file-000.parquet'
@@ -137,7 +136,7 @@ def test_films_show_every_frame_and_say_where_each_episode_begins(episodes, expo
 def test_colors_are_summed_up_as_numbers_are():
     picture = np.random.default_rng(0).integers(0, 256, size=(6, 8, 3), dtype=np.uint8)
     histogram = np.array([np.bincount(picture[..., c].ravel(), minlength=256) for c in range(3)])
-    found = color_statistics(histogram, pixels=48)
+    found = lerobot.color_statistics(histogram, pixels=48)
     rows = picture.reshape(-1, 3) / 255.0
     expected = {'min': rows.min(axis=0), 'max': rows.max(axis=0), 'mean': rows.mean(axis=0)}
     expected |= {'std': rows.std(axis=0)}
