@@ -395,7 +395,9 @@ def _leaves(value: Any, where: str = '') -> Iterator[tuple[str, Any]]:
                 yield from _leaves(getattr(value, item.name), f'{where}.{item.name}')
     elif isinstance(value, np.ndarray | list):
         yield f'{where} length', len(value)
-        for index, element in enumerate(value):
+        # Numbers of NumPy would be shown as `np.float64(0.5)`.
+        elements = value.tolist() if isinstance(value, np.ndarray) else value
+        for index, element in enumerate(elements):
             yield from _leaves(element, f'{where}[{index}]')
     else:
         yield where, value

@@ -162,6 +162,7 @@ def test_check_names_the_first_tick_and_field_that_differ(reach, tmp_path, chang
     assert difference is not None
     assert difference.tick == tick and difference.field.startswith(field)
     assert difference.recorded != difference.simulated
+    assert 'np.' not in str(difference)
 
 
 def test_check_compares_applied_commands_with_received_ones(tmp_path):
