@@ -20,23 +20,21 @@ from msgs_spec.text import first_of, printable
 
 Read = TypeVar('Read')
 
-# Errors: every message is one line of limited length that no terminal obeys.
-
-# Characters of a message: the path at its beginning and the reason at its end are kept.
+# Characters of an error: the path at its beginning and the reason at its end are kept.
 _LONGEST, _BEGINNING = 1000, 700
 
 
-def _line(message: str) -> str:
-    if len(message) > _LONGEST:
-        message = f'{message[:_BEGINNING]} ... {message[_BEGINNING - _LONGEST :]}'
-    return printable(message)
-
-
-class EpisodeLogError(RuntimeError):
-    """An episode cannot be written or recovered; the message is one line with path and reason."""
+class _OneLineError(Exception):
+    """An error with a message of one line, of limited length, that no terminal obeys."""
 
     def __init__(self, message: str) -> None:
-        super().__init__(_line(message))
+        if len(message) > _LONGEST:
+            message = f'{message[:_BEGINNING]} ... {message[_BEGINNING - _LONGEST :]}'
+        super().__init__(printable(message))
+
+
+class EpisodeLogError(_OneLineError, RuntimeError):
+    """An episode cannot be written or recovered; the message is one line with path and reason."""
 
 
 class EpisodeExistsError(EpisodeLogError):
@@ -47,11 +45,8 @@ class EpisodeInUseError(EpisodeLogError):
     """Another process writes or recovers the episode, or has just completed it."""
 
 
-class EpisodeReadError(ValueError):
+class EpisodeReadError(_OneLineError, ValueError):
     """A file is not a valid episode; the message is one line with path and reason."""
-
-    def __init__(self, message: str) -> None:
-        super().__init__(_line(message))
 
 
 _PREFIX, _SUFFIX, _ASIDE = '.', '.active', '.aside'
