@@ -134,18 +134,16 @@ class EpisodeOutcome:
 
     def to_strings(self) -> dict[str, str]:
         """Return the contents of the record, without missing values."""
-        known = {
-            'steps': None if self.steps is None else str(self.steps),
-            'return': None if self.episode_return is None else repr(self.episode_return),
-            'success': None if self.is_success is None else str(self.is_success).lower(),
-            'late_commands': None if self.late_commands is None else str(self.late_commands),
-            'complete': str(self.is_complete).lower(),
-            'reason': self.reason,
-            'received_not_logged': (
-                json.dumps(self.received_not_logged) if self.received_not_logged else None
-            ),
+        values = {
+            'steps': self.steps,
+            'return': self.episode_return,
+            'success': self.is_success,
+            'late_commands': self.late_commands,
+            'complete': self.is_complete,
+            'received_not_logged': self.received_not_logged or None,
         }
-        return {key: text for key, text in known.items() if text is not None}
+        known = {key: json.dumps(value) for key, value in values.items() if value is not None}
+        return known if self.reason is None else {**known, 'reason': self.reason}
 
 
 class HasOutcome:
