@@ -186,11 +186,10 @@ class EpisodeWriter:
         self.end(result, reason)
         return self.store()
 
-    def end(self, result: Mapping[str, str], reason: str | None = None) -> bool:
+    def end(self, result: Mapping[str, str], reason: str | None = None) -> None:
         """Write the last messages, the result and the summary, so that `store` can follow.
 
-        If the process is killed before `store`, recovery finds the whole episode. Returns False if
-        there is nothing to store: without messages or after an earlier error.
+        If the process is killed before `store`, recovery finds the whole episode.
         """
         record = {**result, 'complete': 'true' if reason is None else 'false'}
         if reason is not None:
@@ -198,17 +197,15 @@ class EpisodeWriter:
         if self._received.omitted:
             record['received_not_logged'] = json.dumps(self._received.omitted)
         record = checked_strings(record)
-        if not self._is_open:
-            return False
         if self._bag.message_count == 0:
             self.discard()
-            return False
+        if not self._is_open:
+            return
         self._is_open = False
         try:
             self._description = self._bag.finish(record)
         except OSError as error:
             raise self._fail(error) from error
-        return True
 
     def store(self) -> Path | None:
         """Sync and rename the bag; return its directory, or None if no bag waits for it."""
