@@ -230,7 +230,7 @@ def _tasks(spec: TaskSpec) -> Any:
 
 Columns = dict[str, NDArray[Any]]
 
-QUANTILES = (0.01, 0.10, 0.50, 0.90, 0.99)
+QUANTILES = {'q01': 0.01, 'q10': 0.10, 'q50': 0.50, 'q90': 0.90, 'q99': 0.99}
 # Beginning of the names of observed parts that do not belong to the robot.
 _OBJECT = 'object'
 # Numbers of frames, episodes and tasks.
@@ -305,18 +305,8 @@ def statistics(values: NDArray[Any]) -> dict[str, Any]:
         'mean': numbers.mean(axis=0).tolist(),
         'std': numbers.std(axis=0).tolist(),
         'count': [len(rows)],
-        **{
-            quantile_name(share): quantile.tolist()
-            for share, quantile in zip(
-                QUANTILES, np.quantile(numbers, QUANTILES, axis=0), strict=True
-            )
-        },
+        **{name: np.quantile(numbers, share, axis=0).tolist() for name, share in QUANTILES.items()},
     }
-
-
-def quantile_name(share: float) -> str:
-    """Return the name of a quantile: `q50` for a share of 0.5."""
-    return f'q{round(100 * share):02d}'
 
 
 # Films: every frame of the episodes, drawn from the log
@@ -414,8 +404,8 @@ def color_statistics(histogram: Histogram, pixels: int) -> dict[str, Any]:
         'mean': mean,
         'std': np.sqrt(np.maximum(share @ levels**2 - mean**2, 0.0)),
         **{
-            quantile_name(each): levels[(below >= each * total).argmax(axis=1)]
-            for each in QUANTILES
+            name: levels[(below >= share * total).argmax(axis=1)]
+            for name, share in QUANTILES.items()
         },
     }
     values = {name: each.reshape(3, 1, 1).tolist() for name, each in found.items()}
