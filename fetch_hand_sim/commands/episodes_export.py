@@ -142,7 +142,7 @@ def _why_left_out(episode: EpisodeArrays, others: Sequence[EpisodeArrays], to: s
 def _export(options: argparse.Namespace, by_task: ByTask, name: str) -> dict[str, str]:
     """Write a dataset per task and return its location, text, by task; only Minari uses `name`."""
     if options.to == 'parquet':
-        # Only this format needs pyarrow alone.
+        # pyarrow is an extra, and slow to import.
         from fetch_hand_sim.datasets.parquet import export_parquet
 
         files = export_parquet(by_task, options.output)
