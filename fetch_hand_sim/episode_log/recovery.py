@@ -174,9 +174,7 @@ def _recover(leftover: Path, name: str) -> Path | None:
             leftover.rename(files.aside_path(leftover.parent, name))
             return None
         # A robot may begin its file right now, so its new file and the folder stay.
-        for entry in entries:
-            entry.unlink(missing_ok=True)
-        _remove_empty(leftover)
+        _remove(leftover, entries)
         return None
     with files.open_regular(file) as torn:
         # The process that recovers it locks the file and its replacement.
@@ -187,9 +185,7 @@ def _recover(leftover: Path, name: str) -> Path | None:
             if not remains.is_empty:
                 leftover.rename(files.aside_path(leftover.parent, name))
                 return None
-            for entry in leftover.iterdir():
-                entry.unlink()
-            leftover.rmdir()
+            _remove(leftover, list(leftover.iterdir()))
             return None
         if final.exists():
             raise EpisodeLogError(
@@ -201,7 +197,9 @@ def _recover(leftover: Path, name: str) -> Path | None:
     return final
 
 
-def _remove_empty(leftover: Path) -> None:
+def _remove(leftover: Path, entries: list[Path]) -> None:
+    for entry in entries:
+        entry.unlink(missing_ok=True)
     try:
         leftover.rmdir()
     except OSError as error:

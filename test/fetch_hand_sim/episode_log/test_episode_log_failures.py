@@ -381,18 +381,18 @@ def test_clearing_the_folder_keeps_the_file_of_a_starting_episode(tmp_path, monk
     leftover = files.active_path(tmp_path, 'FetchReach_000000_seed0')
     leftover.mkdir()
     file = files.bag_file(leftover, 'FetchReach_000000_seed0')
-    remove = recovery._remove_empty
+    remove = recovery._remove
 
-    def begins(path):
+    def begins(path, entries):
         file.write_bytes(b'begun')
-        remove(path)
+        remove(path, entries)
 
     # A moment after recovery has found no file.
-    monkeypatch.setattr(recovery, '_remove_empty', begins)
+    monkeypatch.setattr(recovery, '_remove', begins)
     with pytest.raises(EpisodeInUseError):
         recover_episode(leftover)
     assert file.read_bytes() == b'begun'
     file.unlink()
-    monkeypatch.setattr(recovery, '_remove_empty', remove)
+    monkeypatch.setattr(recovery, '_remove', remove)
     assert recover_episode(leftover) is None
     assert not leftover.exists()
