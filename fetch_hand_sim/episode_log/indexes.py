@@ -61,7 +61,7 @@ def parse_file(data: bytes) -> tuple[Contents, Messages]:
     for opcode, position, end in split_records(data[: -len(MCAP0_MAGIC)]):
         if summary_start:
             if opcode in _KNOWN and opcode not in _IN_SUMMARY:
-                raise ValueError(f'ambiguous: {_name(opcode)} after the end of the data')
+                raise ValueError(f'ambiguous: a {_kind(opcode)} record after the end of the data')
             if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
                 contents.define(opcode, data[position + RECORD.size : end])
             summary[opcode].append((position, end))
@@ -69,7 +69,7 @@ def parse_file(data: bytes) -> tuple[Contents, Messages]:
             _check_data_crc(data, position, end)
             summary_start = end
         elif opcode in _SUMMARY_ONLY or (opcode == Opcode.HEADER and position > len(MCAP0_MAGIC)):
-            raise ValueError(f'ambiguous: {_name(opcode)} before the end of the data')
+            raise ValueError(f'ambiguous: a {_kind(opcode)} record before the end of the data')
         else:
             contents.take(opcode, data, position, end)
     require_one_meaning(contents)
@@ -100,13 +100,12 @@ def require_one_meaning(contents: Contents) -> None:
             raise ValueError(f'ambiguous: {count} {what} {shown(name)}; allowed: one')
 
 
-def _name(opcode: int) -> str:
-    return f'a {Opcode(opcode).name.lower().replace("_", " ")} record'
+def _kind(opcode: int) -> str:
+    return Opcode(opcode).name.lower().replace('_', ' ')
 
 
 def _fields(data: bytes, position: int, end: int) -> Fields:
-    kind = Opcode(data[position]).name.lower().replace('_', ' ')
-    return Fields(data[position + RECORD.size : end], kind)
+    return Fields(data[position + RECORD.size : end], _kind(data[position]))
 
 
 def _numbers(data: bytes, position: int, end: int, layout: struct.Struct) -> tuple[int, ...]:
