@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from itertools import accumulate
 from pathlib import Path
@@ -364,13 +365,10 @@ def write_episodes(
     Returns:
         A histogram (3, 256) of each episode: number of pixels by colour channel and level.
     """
-    studio = Studio(camera.width, camera.height, camera.name)
     histograms = [np.zeros((3, _LEVELS), dtype=np.int64) for _ in episodes]
-    try:
+    with closing(Studio(camera.width, camera.height, camera.name)) as studio:
         pictures = _counted(studio, episodes, histograms)
         write_film(path, pictures, rate, keyframe_every=_KEYFRAME_EVERY)
-    finally:
-        studio.close()
     return histograms
 
 
