@@ -341,8 +341,8 @@ def test_a_file_of_one_meaning_is_read_sorted_by_time(parts, finished, tmp_path,
     assert_same(path, finished)
 
 
-@pytest.mark.parametrize('compression', [CompressionType.NONE, CompressionType.LZ4])
-def test_files_of_all_compressions_are_read(finished, tmp_path, compression, monkeypatch):
+@pytest.mark.parametrize('compression', [CompressionType.NONE, CompressionType.ZSTD])
+def test_files_of_other_compressions_are_read(finished, tmp_path, compression, monkeypatch):
     recorder = Recorder('FetchReach')
     monkeypatch.setattr('fetch_hand_sim.episode_log.bag.COMPRESSION', compression)
     original = recorder.record(EpisodeDirectory(tmp_path))
