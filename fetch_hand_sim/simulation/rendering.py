@@ -180,8 +180,8 @@ def _refuse(name: str, value: object, allowed: str) -> NoReturn:
 
 
 def simulation_frame(simulation: Simulation, index: int = 0) -> Frame:
-    """Return the current state of simulation `index` of a batch as a `Frame`, for pictures."""
-    readings, observation = simulation.readings(), simulation.observe()
+    """Return the true state of simulation `index` of a batch as a `Frame`, for pictures."""
+    readings, observation = simulation.true_readings(), simulation.observe()
     achieved, desired = observation['achieved_goal'][index], observation['desired_goal'][index]
     spec = simulation.spec
     return Frame(

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from fetch_hand_sim.simulation import Simulation
+from fetch_hand_sim.simulation.rendering import simulation_frame
 from support.same_bits import assert_same
 from support.tasks import FAMILIES, each_task
 
@@ -155,3 +156,14 @@ def test_sensors_are_read_once_a_step_and_again_after_the_state_was_written() ->
     simulation.write_data(0, data)
     moved = simulation.observe()['achieved_goal'] - result.observation['achieved_goal']
     assert moved[0, 0] == pytest.approx(0.1)
+
+
+def test_pictures_show_the_true_state_and_not_what_disturbed_sensors_measure() -> None:
+    simulation = Simulation(
+        'FetchPush', disturbances={'object': {'noise': 0.05}, 'joints': {'bias': 0.1}}
+    )
+    simulation.reset(seed=0)
+    frame, qpos = simulation_frame(simulation), simulation.task.batch.bind('qpos')[0]
+    assert frame.object_pose is not None
+    assert (frame.object_pose == qpos[-7:]).all()
+    assert (frame.joint_position == qpos[simulation.task.joint_qpos]).all()
