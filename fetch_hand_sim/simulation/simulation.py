@@ -572,12 +572,13 @@ class Simulation:
         return finite_numbers(name, values, shape)
 
     def _fitting(self, data: Any) -> Any:
-        """Return `data`; ValueError unless it is an `MjData` with as many positions as `model`."""
-        shape = (self.model.nq,)
-        if not isinstance(data, mujoco.MjData) or data.qpos.shape != shape:
+        """Return `data`; ValueError unless it is an `MjData` with a state of the same size."""
+        size = self._task.batch.state.shape[1]
+        kind = mujoco.mjtState.mjSTATE_INTEGRATION.value
+        if not isinstance(data, mujoco.MjData) or mujoco.mj_stateSize(data.model, kind) != size:
             raise ValueError(
                 f'data {type(data).__name__}; allowed: a mujoco.MjData of the model of '
-                f'{self.spec.name}, with qpos of shape {shape}'
+                f'{self.spec.name}, with a state of {size} values'
             )
         return data
 

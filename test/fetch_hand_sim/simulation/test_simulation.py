@@ -221,8 +221,9 @@ BAD_CALLS = [
     (lambda one: one.variation('a'), "index 'a'; allowed"),
     (lambda one: one.write_data(0, None), 'data NoneType; allowed: a mujoco.MjData'),
     (
-        lambda one: one.read_data(0, Simulation('HandReach', num_threads=1).data(0)),
-        'data MjData; allowed: .* of FetchPush, with qpos of shape',
+        # Its `qpos` has the same shape, but it has two controls more.
+        lambda one: one.write_data(0, Simulation('FetchPickAndPlace', num_threads=1).data(0)),
+        'data MjData; allowed: .* of FetchPush, with a state of',
     ),
     (lambda one: one.compute_reward('', np.zeros(3)), "achieved_goal ''; allowed: numbers"),
     (lambda one: one.compute_reward(np.zeros(4), np.zeros(3)), r'last axis, not shape \(4,\)'),
