@@ -25,8 +25,8 @@ from fetch_hand_sim.films.recording import Studio, load_recordings
 from fetch_hand_sim.gym_envs.task_attributes import TaskAttributes
 from msgs_spec.arrays import Picture
 
-# Range of the pictures per second of a file.
-_RATES = (0.001, 1000.0)
+# Range of the pictures per second of a file; a GIF shows a picture for 655 s at most.
+_RATES = (0.01, 1000.0)
 
 
 class Film:
@@ -34,7 +34,7 @@ class Film:
 
     Args:
         pictures: (height, width, 3) uint8, all of one size, as returned by `render`.
-        fps: Pictures per second, 0.001 ... 1000.
+        fps: Pictures per second, 0.01 ... 1000.
 
     Raises:
         ValueError: If there are no pictures, or one has another size or type.

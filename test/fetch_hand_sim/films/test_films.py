@@ -51,7 +51,7 @@ PICTURES = [np.full((5, 7, 3), 40 * number, dtype=np.uint8) for number in range(
 @pytest.mark.parametrize('kind', ['.gif', '.webp'])
 @pytest.mark.parametrize(
     ('fps', 'shown'),
-    [(0.25, 51), (30.0, 51), (50.0, 51), (62.5, 26), (125.0, 17), (500.0, 6), (50_000.0, 1)],
+    [(0.01, 51), (30.0, 51), (50.0, 51), (62.5, 26), (125.0, 17), (500.0, 6), (50_000.0, 1)],
 )
 def test_animations_last_as_long_as_asked_at_rates_that_browsers_show(kind, fps, shown, tmp_path):
     path = tmp_path / f'film{kind}'
@@ -330,7 +330,7 @@ def test_a_film_in_memory_gives_back_every_picture_and_plays_in_a_notebook(tmp_p
     ('pictures', 'fps', 'said'),
     [
         ([], 25.0, 'no pictures; allowed: one or more'),
-        (PICTURES, 0.0, 'fps 0; allowed: 0.001 ... 1000'),
+        (PICTURES, 0.0, 'fps 0; allowed: 0.01 ... 1000'),
         (PICTURES, '25', "fps '25'; allowed: a number"),
         (PICTURES, float('inf'), 'fps inf'),
         ([*PICTURES, np.zeros((5, 8, 3), np.uint8)], 25.0, 'picture 5 is uint8 (5, 8, 3)'),
