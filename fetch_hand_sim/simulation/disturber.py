@@ -37,12 +37,11 @@ _SPANS = {
 }
 # In the order in which an episode draws them.
 VARIATIONS = (*_SPANS, 'gravity_direction')
-# Topics computed from the joint sensors, and the sites whose poses they hold.
+# Topics with poses of sites, which are computed from the joint sensors.
 _LED = {
     'end_effector_pose': ('robot0:grip',),
     'fingertip_poses': tuple(f'robot0:S_{name}' for name in FINGERTIPS),
 }
-_JOINT_TOPICS = ('joint_states', 'end_effector_pose', 'end_effector_twist', 'fingertip_poses')
 _OBJECT_TOPICS = ('object_pose', 'object_twist', 'object_joint')
 
 
@@ -299,8 +298,6 @@ class Disturber:
         self._is_true_current = True
         self._sense_joints(ids, true)
         self._sense_object(ids, true, is_first)
-        for name in true.keys() - {*_JOINT_TOPICS, *_OBJECT_TOPICS}:
-            self._held[name][ids] = true[name][ids]
 
     def _delayed(self, name: str, latency: str) -> Array:
         return self._true[name][self.variations[latency].astype(np.intp), self._all]
@@ -308,7 +305,9 @@ class Disturber:
     def _sense_joints(self, ids: Ids, true: Readings) -> None:
         joints = self.disturbances.joints
         measured = {
-            name: self._delayed(name, 'joint_latency') for name in _JOINT_TOPICS if name in true
+            name: self._delayed(name, 'joint_latency')
+            for name in true
+            if name not in _OBJECT_TOPICS
         }
         states, count = measured['joint_states'], len(self._task.spec.robot.joints)
         if joints.velocity_noise:
