@@ -13,7 +13,6 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, TypeVar
 
 import mujoco
@@ -261,7 +260,7 @@ class Simulation:
                 lacks the threads of the batch.
         """
         selected = self._select(ids)
-        given = self._each_given('variation', variation, selected, self._allowed_variation)
+        variations = self._each_given('variation', variation, selected, self._allowed_variation)
         starts = self._each_given(
             'start', start, selected, lambda each: read_start(each, self._task)
         )
@@ -270,7 +269,7 @@ class Simulation:
         for index, generator in zip(selected.tolist(), fresh, strict=True):
             self._generators[index] = generator or self._generators[index]
         if selected.size:
-            self._start(np.sort(selected), given, starts)
+            self._start(np.sort(selected), variations, starts)
         if goals:
             self.set_goal(list(goals.values()), list(goals))
         return self.observe()
@@ -477,16 +476,10 @@ class Simulation:
     def _start(
         self,
         ids: NDArray[np.intp],
-        given: Mapping[int, Mapping[str, float]] = MappingProxyType({}),
-        starts: Mapping[int, StartState] = MappingProxyType({}),
+        variations: Mapping[int, Mapping[str, float]],
+        starts: Mapping[int, StartState],
     ) -> None:
-        """Start episodes of simulations `ids`.
-
-        Args:
-            ids: Sorted indices, (n,).
-            given: Variations that the user sets, by simulation and name.
-            starts: Start states that the user sets, by simulation.
-        """
+        """Start episodes of simulations `ids`, sorted (n,); some have given values, by index."""
         self._require_threads()
         own = [self.generator(i) for i in ids.tolist()]
         streams: list[np.random.Generator] = []
@@ -503,7 +496,7 @@ class Simulation:
                 start.write(batch.bind('qpos')[index], batch.bind('qvel')[index])
             batch.forward(np.array(sorted(starts)))
         if self._disturber is not None:
-            self._disturber.start(ids, streams, given)
+            self._disturber.start(ids, streams, variations)
         self._task.take_diverged()
         self._is_started[ids] = True
 
@@ -544,7 +537,7 @@ class Simulation:
                 self.spec.name,
                 ids.tolist(),
             )
-            self._start(ids)
+            self._start(ids, {}, {})
         return diverged
 
     def _result(self, diverged: NDArray[np.bool_]) -> StepResult:

@@ -78,21 +78,15 @@ def _stop_timers() -> None:
         clock.value = None
 
 
-def keep_in_forks(batch: Batch) -> None:
-    """Prevent forked processes from freeing `batch`, because they do not have its threads."""
-    if batch.nthread > 1:
-        _THREADED.add(batch)
-
-
-def _keep_all() -> None:
+def _keep_batches() -> None:
+    """Never free the batches with threads in a forked process, which does not have the threads."""
     for batch in _THREADED:
         # A list of them would be freed when the process ends.
         ctypes.pythonapi.Py_IncRef(ctypes.py_object(batch))
     _THREADED.clear()
 
 
-if hasattr(os, 'register_at_fork'):
-    os.register_at_fork(after_in_child=_keep_all)
+os.register_at_fork(after_in_child=_keep_batches)
 
 Ids = NDArray[np.intp]
 Generators = Sequence[np.random.Generator]
@@ -112,16 +106,6 @@ class BatchConfig:
     control_hz: float = DEFAULT_CONTROL_HZ
     keeps_data: bool = False
     timing: Timing = 'seconds'
-
-    @property
-    def substeps(self) -> int:
-        """Physics steps per action; ValueError unless `control_hz` is 500/n, n = 1 ... 40."""
-        return substeps_per_tick(self.control_hz)
-
-    @property
-    def threads(self) -> int:
-        """Number of threads of the pool, at most one per simulation."""
-        return min(self.num_threads or len(os.sched_getaffinity(0)), self.num_envs)
 
 
 class Task(ABC):
@@ -152,12 +136,14 @@ class Task(ABC):
     ) -> None:
         prepare_engine()
         self.spec = spec
-        self.substeps = batch.substeps
+        self.substeps = substeps_per_tick(batch.control_hz)
         self.draws_goals = True
         self.model = model
-        self.tick_duration = batch.substeps * float(model.opt.timestep)
-        self.batch = Batch(model, batch.num_envs, batch.threads, batch.keeps_data)
-        keep_in_forks(self.batch)
+        self.tick_duration = self.substeps * float(model.opt.timestep)
+        threads = min(batch.num_threads or len(os.sched_getaffinity(0)), batch.num_envs)
+        self.batch = Batch(model, batch.num_envs, threads, batch.keeps_data)
+        if threads > 1:
+            _THREADED.add(self.batch)
         self.pairs = ListedPairs(model)
         self._outputs: dict[str, Array] = {}
         self._qpos: Array = self.batch.bind('qpos')
@@ -219,8 +205,7 @@ class Task(ABC):
         """Return flags (N,) of the simulations that diverged since the last call."""
         # The last axis is (last info, number).
         warning = self.batch.warning
-        first, second, third = (warning[:, kind, 1] for kind in _THROWN_AWAY)
-        lost = np.asarray(first + second + third > 0)
+        lost: NDArray[np.bool_] = (warning[:, _THROWN_AWAY, 1] > 0).any(axis=1)
         if lost.any():
             # MuJoCo throws its counters away with the state: each loss is number one again.
             warning[:, _THROWN_AWAY] = 0
