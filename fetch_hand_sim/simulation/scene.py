@@ -186,12 +186,9 @@ class Scene:
         first, count = int(body.geomadr[0]), int(body.geomnum[0])
         return [self._geom_marker(geom, frame.object_pose) for geom in range(first, first + count)]
 
-    def table_markers(self) -> list[Marker]:
-        """Return markers of all fixed geoms except robot and floor, such as the table (Fetch)."""
-        return self._table
-
     @cached_property
-    def _table(self) -> list[Marker]:
+    def table_markers(self) -> list[Marker]:
+        """Markers of all fixed geoms except robot and floor, such as the table (Fetch)."""
         model, data = self.model, mujoco.MjData(self.model)
         mujoco.mj_kinematics(model, data)
         markers = []

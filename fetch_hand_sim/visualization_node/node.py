@@ -174,7 +174,7 @@ class VisualizationNode(Node):
             shapes = {
                 'goal': scene.markers(tick.frame),
                 'object': scene.object_markers(tick.frame),
-                'table': scene.table_markers(),
+                'table': scene.table_markers,
             }
             markers = marker_array(shapes, tick.stamp_ns)
             self._outputs['goal_markers'].publish(markers)
