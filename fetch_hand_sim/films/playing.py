@@ -48,7 +48,6 @@ class Film:
         self.fps = float(fps)
         self._roll = Roll()
         self._shape: tuple[int, ...] = ()
-        self._html = ''
         for picture in pictures:
             self._add(picture)
         if not self._shape:
@@ -107,12 +106,10 @@ class Film:
 
     def _repr_html_(self) -> str:
         """Return the film as HTML with embedded data, which notebooks show and save."""
-        if not self._html:
-            buffer = io.BytesIO()
-            write_animation(buffer, self, self.fps, '.webp')
-            data = base64.b64encode(buffer.getvalue()).decode()
-            self._html = f'<img alt="{self!r}" src="data:image/webp;base64,{data}">'
-        return self._html
+        buffer = io.BytesIO()
+        write_animation(buffer, self, self.fps, '.webp')
+        data = base64.b64encode(buffer.getvalue()).decode()
+        return f'<img alt="{self!r}" src="data:image/webp;base64,{data}">'
 
     def _add(self, picture: Picture) -> None:
         array = np.asarray(picture)
