@@ -132,7 +132,6 @@ class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32
         goals = observation['achieved_goal'], self.goal
         info = {'is_success': self._is_success(*goals), 'diverged': diverged}
         terminated = bool(self.compute_terminated(*goals, info))
-        # A diverged simulation has started a new episode, so a subclass cannot go on here.
         truncated = bool(self.compute_truncated(*goals, info)) or diverged
         return observation, float(self.compute_reward(*goals, info)), terminated, truncated, info
 
@@ -212,12 +211,7 @@ class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32
 
 
 # Methods that a step calls if a subclass overrides one of them.
-_EVALUATION = (
-    '_get_obs',
-    '_is_success',
-    'compute_terminated',
-    'compute_truncated',
-)
+_EVALUATION = ('_get_obs', '_is_success', 'compute_terminated', 'compute_truncated')
 
 
 def _first(observation: Observation) -> Observation:

@@ -305,7 +305,6 @@ class FetchEnv(RobotEnv):
     """
 
     def __init__(self, task: str, **arguments: Any) -> None:
-        """Compile the model of a task; `arguments` are those of `FetchHandEnv`."""
         super().__init__(task, **arguments)
         physics = self.simulation.task
         assert isinstance(physics, FetchTask)
@@ -337,7 +336,6 @@ class HandReachEnv(RobotEnv):
     """
 
     def __init__(self, task: str = 'HandReach', **arguments: Any) -> None:
-        """Compile the model of a task; `arguments` are those of `FetchHandEnv`."""
         super().__init__(task, **arguments)
         physics = self.simulation.task
         assert isinstance(physics, HandReachTask)

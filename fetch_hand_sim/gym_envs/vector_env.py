@@ -337,7 +337,6 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
             each = [int(seed) + i for i in range(self.num_envs)]  # type: ignore[arg-type]
         if len(each) != self.num_envs:
             raise ValueError(f'{self.num_envs} environments take as many seeds, not {len(each)}')
-        # An environment without a seed draws one, which `np_random_seed` returns.
         return [
             seeding.np_random()[1] if new is None and old is None else new
             for new, old in zip(each, self._seeds, strict=True)

@@ -149,16 +149,7 @@ class StartState:
 
 
 def read_start(given: Any, task: Task) -> StartState:
-    """Return the start state that a user describes, or raise ValueError.
-
-    Joints and objects with a given position start at rest unless a velocity is given, too.
-
-    Args:
-        given: A mapping with some of these entries. `joints` (rad or m) and `joint_velocities`
-            (rad/s or m/s) are numbers by joint name, or all in the order of `joint_states`.
-            `object_pose` is (7,), m and quaternion wxyz, world. `object_velocity`, allowed only
-            with a pose, is (6,), linear m/s and angular rad/s, world axes.
-    """
+    """Return the start state that `start` of `Simulation.reset` describes, or raise ValueError."""
     parts, start = entries('start', given, PARTS), StartState()
     settled = task.new_data(task.start_state).qpos
     for name, value in _by_joint('joints', parts, task).items():

@@ -81,7 +81,7 @@ def _process_that_draws() -> int:
 
 @functools.cache
 def _backend() -> str:
-    """Choose the backend: `MUJOCO_GL` if set, else the first usable of GLFW, EGL, OSMesa.
+    """Choose the backend.
 
     GLFW is not tried without a display, because a second attempt would end the process.
     """

@@ -244,9 +244,10 @@ class Simulation:
                 one or None for each simulation of `ids`.
             start: Start states in place of drawn ones: one mapping for all, or one or None for each
                 simulation of `ids`. Its keys are some of `joints`, `joint_velocities` (numbers by
-                name, or all in the order of `joint_states`; rad or m), `object_pose` (7,) and
-                `object_velocity` (6,). Joints and objects with a given position start at rest
-                unless a velocity is given, too. `disturbances` may shift the start.
+                name, or all in the order of `joint_states`; rad or m, per second), `object_pose`
+                (7,), m and quaternion wxyz, and, only with a pose, `object_velocity` (6,), linear
+                m/s and angular rad/s, both world. Joints and objects with a given position start at
+                rest unless a velocity is given, too. `disturbances` may shift the start.
             goal: Desired goals in place of drawn ones, as `set_goal` takes them: (goal size,) for
                 all, or one or None for each simulation of `ids`. Drawn starts stay the same.
 
