@@ -29,8 +29,8 @@ def require_whole(name: str, value: Any, lowest: int = 0, highest: int | None = 
         raise ValueError(f'{name} {one_line(repr(value), 40)}; allowed: whole numbers {allowed}')
 
 
-def finite_numbers(name: str, values: ArrayLike, *shapes: tuple[int, ...]) -> NDArray[np.floating]:
-    """Return finite numbers of one of `shapes` as an array, or raise ValueError.
+def finite_numbers(name: str, values: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.floating]:
+    """Return finite numbers of this shape as an array, or raise ValueError.
 
     A float32 array stays float32; other numbers become float64.
     """
@@ -40,10 +40,9 @@ def finite_numbers(name: str, values: ArrayLike, *shapes: tuple[int, ...]) -> ND
         # Rows of different lengths.
         array = np.array(None)
     is_number = array.dtype.kind in 'iuf'
-    if array.shape not in shapes or not is_number:
+    if array.shape != shape or not is_number:
         given = f'shape {array.shape}' if is_number else one_line(values, 40)
-        allowed = ' or '.join(map(str, shapes))
-        raise ValueError(f'{name}: {given} given; allowed: numbers of shape {allowed}')
+        raise ValueError(f'{name}: {given} given; allowed: numbers of shape {shape}')
     if array.dtype not in (np.float32, np.float64):
         array = array.astype(np.float64)
     if not np.isfinite(array).all():
