@@ -131,8 +131,6 @@ def _has_device() -> bool:
 
 def _has_display() -> bool:
     """Return whether a window can be opened; `DISPLAY` alone may name a session that has ended."""
-    if sys.platform != 'linux':
-        return True
     if not (os.environ.get('DISPLAY') or os.environ.get('WAYLAND_DISPLAY')):
         return False
     try:

@@ -20,7 +20,6 @@ from msgs_spec.parameters import LARGEST_PICTURE_SIDE
 from msgs_spec.text import entries, one_line, one_of
 
 WIDTH, HEIGHT = 640, 480
-LARGEST_SIDE = LARGEST_PICTURE_SIDE
 
 
 class SceneRenderer:
@@ -30,8 +29,8 @@ class SceneRenderer:
     that created the renderer may.
 
     Args:
-        width: Pixels, 1 ... `LARGEST_SIDE`.
-        height: Pixels, 1 ... `LARGEST_SIDE`.
+        width: Pixels, 1 ... `LARGEST_PICTURE_SIDE`.
+        height: Pixels, 1 ... `LARGEST_PICTURE_SIDE`.
         camera: Name of a camera of the model, or attributes of `mujoco.MjvCamera` that change the
             scene's view; None for the unchanged view.
 
@@ -123,9 +122,9 @@ def make_options() -> mujoco.MjvOption:
 
 
 def check_size(width: object, height: object) -> None:
-    """Raise ValueError unless both sides of a picture are 1 ... `LARGEST_SIDE` pixels."""
+    """Raise ValueError unless both sides of a picture are 1 ... `LARGEST_PICTURE_SIDE` pixels."""
     for name, side in (('width', width), ('height', height)):
-        require_whole(name, side, 1, LARGEST_SIDE)
+        require_whole(name, side, 1, LARGEST_PICTURE_SIDE)
 
 
 def make_camera(scene: Scene, name: str | Mapping[str, Any] | None) -> mujoco.MjvCamera:
