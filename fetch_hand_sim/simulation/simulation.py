@@ -35,7 +35,7 @@ from fetch_hand_sim.simulation.arguments import (
 )
 from fetch_hand_sim.simulation.disturber import Disturber
 from fetch_hand_sim.simulation.models import asset_path, find
-from fetch_hand_sim.simulation.tasks import Task, make_task
+from fetch_hand_sim.simulation.tasks import make_task
 from fetch_hand_sim.simulation.tasks.task import BatchConfig
 from msgs_spec.arrays import Array
 from msgs_spec.disturbances import Disturbances, read_disturbances
@@ -102,6 +102,7 @@ class Simulation:
             state.
 
     Attributes:
+        task: The `Task`, which computes the physics.
         spec: The task as data, with `episode_ticks` at this rate.
         metric: `GoalMetric` for rewards and success; users may replace it between steps.
         divergences: Number of divergences of all copies so far.
@@ -128,13 +129,13 @@ class Simulation:
             raise ValueError(f'keeps_data {keeps_data!r:.60}; allowed: True or False')
         one_of(timing, TIMINGS, 'timing')
         self._batch = BatchConfig(num_envs, num_threads, control_hz, keeps_data, timing)
-        self._task = make_task(task, self._batch)
+        self.task = make_task(task, self._batch)
         self._model_may_change = False
-        self.spec = self._task.spec
+        self.spec = self.task.spec
         self.num_envs = num_envs
         self.control_hz = control_hz
         self.timing = timing
-        self.metric = self._task.goal_metric(success_rule, reward_type)
+        self.metric = self.task.goal_metric(success_rule, reward_type)
         self.divergences = 0
         self.goals = np.zeros((num_envs, self.spec.goal.size))
         self._generators: list[np.random.Generator | None] = [None] * num_envs
@@ -164,19 +165,14 @@ class Simulation:
         self._goals = wanted.astype(np.float64, copy=False)
 
     @property
-    def task(self) -> Task:
-        """The `Task`, which computes the physics."""
-        return self._task
-
-    @property
     def model(self) -> Any:
         """The compiled `mujoco.MjModel`; call `apply_model_changes` after writing into it."""
-        return self._task.model
+        return self.task.model
 
     @property
     def asset(self) -> Path:
         """The MJCF file of the model."""
-        return asset_path(self._task.asset)
+        return asset_path(self.task.asset)
 
     @property
     def is_started(self) -> NDArray[np.bool_]:
@@ -186,11 +182,11 @@ class Simulation:
     @property
     def tick_duration(self) -> float:
         """Simulated seconds per step."""
-        return self._task.tick_duration
+        return self.task.tick_duration
 
     def data(self, index: int) -> Any:
         """Return a copy of simulation `index` as a `mujoco.MjData`, to render or inspect."""
-        return self._task.batch.get_data(self._index(index))
+        return self.task.batch.get_data(self._index(index))
 
     def read_data(self, index: int, data: Any) -> None:
         """Copy the state of simulation `index` into a `mujoco.MjData`.
@@ -198,11 +194,11 @@ class Simulation:
         With `keeps_data`, all values that MuJoCo derives from the state, such as contacts, are
         copied, too. Goals, random generators and divergence counters are no part of `MjData`.
         """
-        self._task.read_data(self._index(index), self._fitting(data))
+        self.task.read_data(self._index(index), self._fitting(data))
 
     def write_data(self, index: int, data: Any) -> None:
         """Set state and derived values of simulation `index` to those of a `mujoco.MjData`."""
-        self._task.write_data(self._index(index), self._fitting(data))
+        self.task.write_data(self._index(index), self._fitting(data))
         if self._disturber is not None:
             self._disturber.note_written_state()
 
@@ -214,7 +210,7 @@ class Simulation:
                 'physics; leave out the group physics'
             )
         self._model_may_change = True
-        self._task.follow_model()
+        self.task.follow_model()
 
     def generator(self, index: int) -> np.random.Generator:
         """Return the random generator itself that draws starts and goals of simulation `index`."""
@@ -263,7 +259,7 @@ class Simulation:
         selected = self._select(ids)
         variations = self._each_given('variation', variation, selected, self._allowed_variation)
         starts = self._each_given(
-            'start', start, selected, lambda each: read_start(each, self._task)
+            'start', start, selected, lambda each: read_start(each, self.task)
         )
         goals = self._each_given('goal', goal, selected, self._read_goal)
         fresh = generators(seed, selected)
@@ -293,7 +289,7 @@ class Simulation:
             raise ValueError(
                 f'actions[{env}, {part}] is {checked[env, part]}; allowed: numbers in [-1, 1]'
             )
-        return self._result(self._advance(self._task.commands_from_actions(checked)))
+        return self._result(self._advance(self.task.commands_from_actions(checked)))
 
     def step_commands(self, commands: ArrayLike) -> StepResult:
         """Advance every simulation by one step, with commands in ROS units; see `step`.
@@ -337,7 +333,7 @@ class Simulation:
         shape = (selected.size, self.spec.goal.size)
         wanted = np.array(finite_numbers(f'goals of {self.spec.name}', goals, shape), np.float64)
         if self.spec.goal is GoalKind.POSE:
-            wanted = nearest_quaternions(wanted, self._task.observe()[1][selected])
+            wanted = nearest_quaternions(wanted, self.task.observe()[1][selected])
         self.goals[selected] = wanted
 
     def perturb(self, body: str, wrench: ArrayLike, index: int = 0) -> None:
@@ -359,7 +355,7 @@ class Simulation:
 
     def resting_commands(self) -> Array:
         """Return the commands (N, action size) that leave the robots' present targets unchanged."""
-        return self._task.resting_commands()
+        return self.task.resting_commands()
 
     @property
     def disturbances(self) -> Disturbances:
@@ -372,7 +368,7 @@ class Simulation:
         chosen = read_disturbances(disturbances)
         if self._disturber is not None:
             self._disturber.start_nominal(self._all)
-        self._disturber = None if chosen.is_off else Disturber(self._task, chosen)
+        self._disturber = None if chosen.is_off else Disturber(self.task, chosen)
         self._is_started[:] = False
 
     @property
@@ -394,18 +390,18 @@ class Simulation:
     def true_readings(self) -> Readings:
         """Return the readings of undisturbed sensors, in the form of `readings`."""
         disturber = self._disturber
-        return self._task.readings() if disturber is None else disturber.true_readings()
+        return self.task.readings() if disturber is None else disturber.true_readings()
 
     def observe(self) -> Observation:
         """Return the present observation of all simulations, as in `StepResult`, in new arrays."""
         if self._disturber is None:
-            return self._sensed(*self._task.observe())
-        sensed, _ = self._task.observe_from(self._disturber.readings())
+            return self._sensed(*self.task.observe())
+        sensed, _ = self.task.observe_from(self._disturber.readings())
         return self._sensed(sensed, achieved_goal(self.spec, self._disturber.true_readings()))
 
     def observe_from(self, readings: Readings) -> Observation:
         """Return observation and achieved goal computed from a result of `readings`."""
-        return self._sensed(*self._task.observe_from(readings))
+        return self._sensed(*self.task.observe_from(readings))
 
     def __copy__(self) -> Simulation:
         """Return a deep copy, so that copies share neither physics nor random generators."""
@@ -421,9 +417,9 @@ class Simulation:
             },
             'disturbed': None if self._disturber is None else self._disturber.state(),
             'model': self.model if self._model_may_change else None,
-            'pairs': self._task.pairs if self._model_may_change else None,
+            'pairs': self.task.pairs if self._model_may_change else None,
             'metric': self.metric,
-            'physics': self._task.physics_state(),
+            'physics': self.task.physics_state(),
             'goals': self.goals.copy(),
             'generators': self._generators,
             'divergences': self.divergences,
@@ -435,11 +431,11 @@ class Simulation:
         """Compile the model again and restore the state, bit for bit."""
         Simulation.__init__(self, **state['arguments'])
         if state['model'] is not None:
-            self._task.take_model(state['model'], state['pairs'])
+            self.task.take_model(state['model'], state['pairs'])
             self._model_may_change = True
         self.metric = state['metric']
-        self._task.set_physics_state(state['physics'])
-        self._task.take_diverged()
+        self.task.set_physics_state(state['physics'])
+        self.task.take_diverged()
         if self._disturber is not None:
             self._disturber.set_state(state['disturbed'])
         self.goals[:] = state['goals']
@@ -490,15 +486,15 @@ class Simulation:
             sources: list[Any] = [each.bit_generator for each in own]
             streams = [np.random.Generator(source.jumped()) for source in sources]
             self._disturber.start_nominal(ids)
-        self.goals[ids] = self._task.reset(ids, own)
+        self.goals[ids] = self.task.reset(ids, own)
         if starts:
-            batch = self._task.batch
+            batch = self.task.batch
             for index, start in starts.items():
                 start.write(batch.bind('qpos')[index], batch.bind('qvel')[index])
             batch.forward(np.array(sorted(starts)))
         if self._disturber is not None:
             self._disturber.start(ids, streams, variations)
-        self._task.take_diverged()
+        self.task.take_diverged()
         self._is_started[ids] = True
 
     def _sensed(self, observation: Array, achieved_goal: Array) -> Observation:
@@ -518,16 +514,16 @@ class Simulation:
         if self._disturber is not None:
             commands = self._disturber.command(commands)
             self._is_pushed |= self._disturber.push(self._pushes)
-        self._task.apply_commands(commands)
+        self.task.apply_commands(commands)
         try:
-            self._task.step()
+            self.task.step()
             failed = np.zeros(self.num_envs, dtype=bool)
         except SimulationError as error:
             failed = np.isin(self._all, error.ids)
         if self._is_pushed:
             self._pushes[:] = 0.0
             self._is_pushed = False
-        diverged = failed | self._task.take_diverged()
+        diverged = failed | self.task.take_diverged()
         if self._disturber is not None:
             self._disturber.sense()
         if diverged.any():
@@ -550,12 +546,12 @@ class Simulation:
     @property
     def _pushes(self) -> Array:
         """External wrenches on the bodies, (N, bodies, 6); MuJoCo applies values written here."""
-        pushes: Array = self._task.batch.bind('xfrc_applied')
+        pushes: Array = self.task.batch.bind('xfrc_applied')
         return pushes
 
     def _require_threads(self) -> None:
         """Raise RuntimeError in a forked process, which lacks the threads of the batch."""
-        if self._process != os.getpid() and self._task.batch.nthread > 1:
+        if self._process != os.getpid() and self.task.batch.nthread > 1:
             raise RuntimeError(
                 'this process was forked and lacks the threads of the batch: create the batch '
                 'here, copy it (copy.deepcopy), or use num_threads=1'
@@ -567,7 +563,7 @@ class Simulation:
 
     def _fitting(self, data: Any) -> Any:
         """Return `data`; ValueError unless it is an `MjData` with a state of the same size."""
-        size = self._task.batch.state.shape[1]
+        size = self.task.batch.state.shape[1]
         kind = mujoco.mjtState.mjSTATE_INTEGRATION.value
         if not isinstance(data, mujoco.MjData) or mujoco.mj_stateSize(data.model, kind) != size:
             raise ValueError(

@@ -59,7 +59,7 @@ class GambleSimulation(Simulation):
         super()._start(ids, *given)
         for index in ids.tolist():
             self._over[index] = False
-            self._landing[index] = self._task.sample_goal(index, self.generator(index))
+            self._landing[index] = self.task.sample_goal(index, self.generator(index))
 
     def step(self, actions: ArrayLike) -> StepResult:
         """Step as `Simulation.step` does; the first gripper action above 0.9 is a gamble."""
