@@ -137,7 +137,7 @@ class RobotDescription:
         parent = model.body(parent_body).name if parent_body else ROOT
         origin = Pose(model.body_pos[body].copy(), model.body_quat[body].copy())
         first = int(model.body_jntadr[body])
-        moving = range(first, first + int(model.body_jntnum[body])) if first >= 0 else range(0)
+        moving = range(first, first + int(model.body_jntnum[body]))
         for index in moving:
             # The anchor only matters for hinges.
             is_hinge = int(model.jnt_type[index]) == mujoco.mjtJoint.mjJNT_HINGE.value

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import ctypes
 import functools
-import inspect
 import logging
 import os
 import weakref
@@ -252,9 +251,9 @@ class Task(ABC):
             raise ValueError(
                 f'{self.spec.name} has no sensor {name!r}; allowed: {", ".join(allowed)}'
             )
-        is_own = inspect.ismethod(function) and function.__self__ is self
-        unbound: Any = function.__func__ if inspect.ismethod(function) else None
-        self._sensors[name] = unbound if is_own else lambda _: function()
+        method: Any = function
+        is_own = getattr(method, '__self__', None) is self
+        self._sensors[name] = method.__func__ if is_own else lambda _: function()
 
     @property
     def sensors(self) -> tuple[str, ...]:
