@@ -321,6 +321,8 @@ def read_disturbances(given: str | Mapping[str, Any] | Disturbances | None) -> D
         raise ValueError(f'{path}: larger than {_LONGEST_FILE:,} bytes')
     try:
         return Disturbances.from_dict(_parsed(path.read_text(errors='replace')))
+    except OSError as error:
+        raise ValueError(f'{path}: {error.strerror}') from None
     except ValueError as error:
         raise ValueError(f'{path}: {error}') from None
 
@@ -333,7 +335,7 @@ def _parsed(text: str) -> Any:
 
         try:
             return yaml.safe_load(text)
-        except (yaml.YAMLError, RecursionError) as error:
+        except Exception as error:  # PyYAML raises unrelated types, such as KeyError for `!!bool x`
             raise ValueError(f'neither JSON nor YAML: {one_line(error)}') from None
 
 

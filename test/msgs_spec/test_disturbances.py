@@ -52,6 +52,9 @@ def test_scaling_follows_the_meaning_of_a_field() -> None:
         ('{"physics": {"friction": [2, 1]}}', '[2, 1]'),
         ('{"physics": 3}', "'3'"),
         ('{broken', 'JSON'),
+        ('{action: !!bool x}', 'YAML'),
+        # A regular file whose first bytes cannot be read.
+        ('/proc/self/mem', '/proc/self/mem: Input/output error'),
     ],
 )
 def test_bad_input_is_one_line_that_names_the_value(given: str, named: str) -> None:
