@@ -10,6 +10,7 @@ out with a warning; `fetch_hand_sim.simulation.check_task` finds subtle mistakes
 from __future__ import annotations
 
 import logging
+import math
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -297,20 +298,19 @@ def substeps_per_tick(control_hz: float) -> int:
     try:
         control_hz = float(control_hz)
     except OverflowError:
-        control_hz = float('inf')
-    smallest, largest = 1, 40
-    period = 1.0 / (control_hz * PHYSICS_TIMESTEP) if control_hz > 0 else float('inf')
-    substeps = round(period) if period < 1e9 else 10**9
-    if smallest <= substeps <= largest and abs(period - substeps) < 1e-6:
+        control_hz = math.inf
+    fewest, most = 1, 40
+    period = 1.0 / PHYSICS_TIMESTEP / control_hz if control_hz > 0 else math.inf
+    clipped = min(max(period, fewest), most)
+    substeps = round(clipped)
+    if abs(period - substeps) < 1e-6:
         return substeps
-    lower = min(max(int(period) if period < 1e9 else largest, smallest), largest)
-    # No rate above 500 Hz is valid.
-    upper = min(lower + 1, largest) if period > smallest else lower
-    rates = sorted({1.0 / (n * PHYSICS_TIMESTEP) for n in (lower, upper)})
+    neighbours = (math.floor(clipped), math.ceil(clipped))
+    rates = sorted({1.0 / (n * PHYSICS_TIMESTEP) for n in neighbours})
     nearest = ' and '.join(f'{rate:.9g}' for rate in rates)
     raise ValueError(
         f'control_hz {control_hz:g} is not a whole number of {PHYSICS_TIMESTEP * 1e3:g} ms '
-        f'substeps; allowed: 500/n Hz for n = {smallest} ... {largest} (12.5 ... 500), nearest: '
+        f'substeps; allowed: 500/n Hz for n = {fewest} ... {most} (12.5 ... 500), nearest: '
         f'{nearest}'
     )
 

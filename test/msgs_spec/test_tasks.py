@@ -79,6 +79,7 @@ def test_whole_numbers_of_substeps(hz, substeps):
         (30.0, '29.4117647 and 31.25'),
         (1000.0, '500$'),
         (0.0, '12.5'),
+        (5e-324, '12.5'),
         (float('nan'), '12.5'),
         (float('inf'), '500'),
     ],
