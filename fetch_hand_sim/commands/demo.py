@@ -201,8 +201,8 @@ class Demo:
             except ValueError:
                 continue
             # Another simulator node may log into the same folder.
-            is_own = record.task.name == self._spec.name
-            if not is_own or record.seed != self._options.seed + record.episode:
+            seed = (self._options.seed + record.episode) % (LARGEST_SEED + 1)
+            if (record.task.name, record.seed) != (self._spec.name, seed):
                 continue
             outcome = summary.outcome
             self._outcomes.append(outcome)

@@ -33,12 +33,14 @@ def test_the_demo_logs_episodes_and_stops_in_order(
     directory = '20261125 #1'
     (tmp_path / 'mine.py').write_text('def make(task): return lambda observation: [0.0] * 4')
     options = ('--episodes', '100', f'--episode-dir=~/{directory}', '--policy=mine:make', '--trust')
+    options += ('--seed', '4294967295')
     environment = ros_environment | {'HOME': str(tmp_path)}
     demo = start_process(*DEMO, *options, env=environment, cwd=tmp_path)
     header = 'episode seed steps return success file'
     assert demo.stdout.readline().split() == header.split()
-    row = demo.stdout.readline().split()
-    assert row[:4] == ['0', '0', '50', '-50']
+    rows = [demo.stdout.readline().split()[:4] for _ in range(2)]
+    # The first seed follows the last.
+    assert rows == [['0', '4294967295', '50', '-50'], ['1', '0', '50', '-50']]
     demo.send_signal(number)
     output, errors = demo.communicate(timeout=30)
     assert (demo.returncode, errors) == (code, 'fetch_hand_sim demo: stopping\n')
