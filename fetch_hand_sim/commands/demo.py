@@ -37,6 +37,7 @@ from node_runtime.command_line import (
     say,
     whole_number,
 )
+from node_runtime.event_loop import EventLoop
 from node_runtime.node_main import StopSignals, destroy, find_place_for_logs
 from node_runtime.ros import (
     DISCOVERY_TIME,
@@ -63,13 +64,11 @@ class Watcher:
 
     def __init__(self, spec: TaskSpec) -> None:
         import rclpy
-        from rclpy.executors import SingleThreadedExecutor
 
         self.has_started = False
         self._spec = spec
         self._node = rclpy.create_node('demo')
-        self._executor = SingleThreadedExecutor()
-        self._executor.add_node(self._node)
+        self._loop = EventLoop(self._node)
         subscribe(self._node, topic(spec, 'episode_status'), self._on_status)
 
     def others(self) -> str:
@@ -94,11 +93,11 @@ class Watcher:
 
     def spin(self) -> None:
         """Wait at most 50 ms for a message and handle it."""
-        self._executor.spin_once(timeout_sec=0.05)
+        self._loop.wait(0.05)
 
     def close(self, exit_code: int) -> None:
         """Destroy the ROS node; end this process with `exit_code` if that takes over 10 s."""
-        self._executor.remove_node(self._node)
+        self._loop.close()
         destroy(self._node, exit_code)
 
     def _on_status(self, message: Any) -> None:
