@@ -11,7 +11,6 @@ from fetch_hand_sim.simulation.rewards import GoalMetric
 from fetch_hand_sim.simulation.scene import TRAIL_TICKS, Frame, tracked_position
 from fetch_hand_sim.view.picture import Graphs, Picture, Series
 from msgs_spec.arrays import Array
-from msgs_spec.tasks import TaskSpec
 
 # Range of each finger of the Fetch, metres (`fetch/robot.xml`).
 _FINGER_RANGE = 0.05
@@ -21,29 +20,29 @@ class Curves:
     """Stores goal distances, rewards, commands and joint positions of the last ticks.
 
     Args:
-        metric: Computes the distance to the goal.
+        metric: Computes the distance to the goal of its task.
         length: Number of ticks to store.
     """
 
-    def __init__(self, spec: TaskSpec, metric: GoalMetric, length: int = 250) -> None:
-        self._spec = spec
-        self.metric = metric
+    def __init__(self, metric: GoalMetric, length: int = 250) -> None:
+        self._metric = metric
+        robot = metric.spec.robot
         # Columns: time, distance, rotation, reward, commands, positions.
         self._rows: deque[Array] = deque(maxlen=length)
         self._fingers = [
-            index for index, name in enumerate(spec.robot.joints) if 'gripper_finger' in name
+            index for index, name in enumerate(robot.joints) if 'gripper_finger' in name
         ]
         self._grippers = [
-            index for index, part in enumerate(spec.robot.command) if part.name == 'gripper'
+            index for index, part in enumerate(robot.command) if part.name == 'gripper'
         ]
         self._commanded = [
-            spec.robot.joints.index(part.name) if part.name in spec.robot.joints else None
-            for part in spec.robot.command
+            robot.joints.index(part.name) if part.name in robot.joints else None
+            for part in robot.command
         ]
 
     def add(self, time: float, frame: Frame, reward: float | None, command: Array | None) -> None:
         """Append a tick at `time`, simulated seconds; a reset has no reward and no command."""
-        distance, rotation = self.metric.distances(frame.achieved_goal, frame.desired_goal)
+        distance, rotation = self._metric.distances(frame.achieved_goal, frame.desired_goal)
         # The reference's angle between q and -q is 2 pi; the page shows the shorter way.
         rotation = np.minimum(rotation, 2.0 * np.pi - rotation)
         values = np.full((2, len(self._commanded)), np.nan)
@@ -55,15 +54,15 @@ class Curves:
 
     def graphs(self, ticks: int | None = None) -> Graphs:
         """Return the curves of the oldest `ticks` stored ticks; None returns all."""
-        commands = len(self._commanded)
+        spec, commands = self._metric.spec, len(self._commanded)
         rows = np.concatenate([[], *self._rows]).reshape(-1, 4 + 2 * commands)[:ticks]
 
         def series(columns: int | slice) -> Series:
             return Series(rows[:, 0], rows[:, columns])
 
         return Graphs(
-            distance=series(1) if self._spec.position_counts else None,
-            rotation=None if self._spec.rotation_threshold is None else series(2),
+            distance=series(1) if spec.position_counts else None,
+            rotation=None if spec.rotation_threshold is None else series(2),
             reward=series(3),
             commands=series(slice(4, 4 + commands)),
             positions=series(slice(4 + commands, None)),
@@ -86,15 +85,11 @@ class Curves:
 class History:
     """Stores a robot's newest tick with its trail (`picture`), and its past ticks (`curves`)."""
 
-    def __init__(self, spec: TaskSpec, metric: GoalMetric) -> None:
-        self.spec = spec
-        self.picture = Picture(spec.name)
-        self.curves = Curves(spec, metric)
+    def __init__(self, metric: GoalMetric) -> None:
+        self.metric = metric
+        self.picture = Picture(metric.spec.name)
+        self.curves = Curves(metric)
         self._trail: deque[Array] = deque(maxlen=TRAIL_TICKS)
-
-    def use_metric(self, metric: GoalMetric) -> None:
-        """Remove the curves and begin new ones with another metric."""
-        self.curves = Curves(self.spec, metric)
 
     def begin_episode(self) -> None:
         """Remove the trail of the last episode."""
@@ -103,11 +98,11 @@ class History:
     def add(self, stamp_ns: int, frame: Frame, reward: float | None, command: Array | None) -> None:
         """Append a tick; if its stamp is before the last one, first remove the old curves."""
         if stamp_ns < self.picture.stamp_ns:
-            self.use_metric(self.curves.metric)
+            self.curves = Curves(self.metric)
         self._trail.append(tracked_position(frame))
         self.curves.add(stamp_ns * 1e-9, frame, reward, command)
         self.picture = Picture(
-            self.spec.name, frame, stamp_ns, trail=tuple(self._trail), command=command
+            self.picture.task, frame, stamp_ns, trail=tuple(self._trail), command=command
         )
 
     def show_goal(self, goal: Array) -> None:

@@ -98,7 +98,7 @@ class LiveRobot:
         if not self._is_new or self._history is None:
             return None
         self._is_new = False
-        history, facts, spec = self._history, self._facts, self._history.spec
+        history, facts, spec = self._history, self._facts, self._history.metric.spec
         commander = facts.commander
         if self._policy and 'policy_node' in commander:
             commander = f'{commander}: {self._policy}'
@@ -152,9 +152,13 @@ class LiveRobot:
     def _on_status(self, status: EpisodeStatus) -> None:
         self._hear()
         spec = task_spec(status.task, status.joint_prefix, status.control_hz)
-        if self._history is not None and self._history.spec.name != spec.name:
+        if self._history is not None and self._history.metric.spec.name != spec.name:
             self._forget_requests()
-        history = self._history = self._history_for(spec, status)
+        metric = GoalMetric(spec, success_rule=status.success_rule)
+        history = self._history
+        # A waiting robot has no episode yet.
+        if history is None or history.metric != metric or status.phase == 'waiting':
+            history = self._history = History(metric)
         self._requests.take_task(spec)
         # The reset itself may be missing among the ticks of a fast robot.
         facts = self._facts
@@ -166,22 +170,9 @@ class LiveRobot:
             self._requests.begin_episode()
         self._update_facts(phase=status.phase, episode=status.episode, seed=status.seed)
 
-    def _history_for(self, spec: TaskSpec, status: EpisodeStatus) -> History:
-        """Return the `History` (trail and curves) to which the next ticks are added.
-
-        It is new for another task or in the phase `waiting`. A new success rule clears its curves.
-        """
-        known, rule = self._history, status.success_rule
-        # A waiting robot has no episode yet.
-        if known is None or known.spec.name != spec.name or status.phase == 'waiting':
-            return History(spec, GoalMetric(spec, success_rule=rule))
-        if known.curves.metric.success_rule != rule:
-            known.use_metric(GoalMetric(spec, success_rule=rule))
-        return known
-
     def _on_tick(self, tick: SeenTick) -> None:
         history, facts = self._history, self._facts
-        if self.spec is None or history is None:
+        if history is None:
             return
         self._hear()
         self._replays.count_tick()

@@ -162,7 +162,7 @@ class Player:
         self._recording = recording = load_recording(self._paths[number])
         self._number, self._position, self._notice = number, 0.0, ''
         arrays = recording.arrays
-        self._curves = Curves(recording.spec, recording.metric, length=len(recording.frames))
+        self._curves = Curves(recording.metric, length=len(recording.frames))
         for tick, frame in enumerate(recording.frames):
             step = tick - 1
             reward = float(arrays.rewards[step]) if tick else None

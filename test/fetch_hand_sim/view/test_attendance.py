@@ -146,6 +146,10 @@ def test_pictures_show_new_goals_at_once_and_nothing_of_an_earlier_robot(robot):
     # Curves begin again where time goes back.
     follow(robot, [10**9], episode=1)
     assert robot.picture().graphs.reward.times.tolist() == [1.0]
+    # A restarted robot with another rate; the page may miss that it waited.
+    follow(robot, [2 * 10**9], episode=2, control_hz=50.0)
+    picture = robot.picture()
+    assert picture.facts.ticks == 100 and picture.graphs.reward.times.tolist() == [2.0]
     follow(robot, phase='waiting')
     picture = robot.picture()
     assert picture.frame is None and picture.facts.phase == 'waiting'

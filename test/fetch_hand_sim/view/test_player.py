@@ -178,7 +178,7 @@ def test_deleted_episodes_are_reported(folder, tmp_path, clock):
 def test_fingers_are_comparable_with_the_command_of_the_gripper():
     simulation = Simulation('FetchPickAndPlace', num_threads=1)
     spec, model = simulation.spec, simulation.model
-    curves = Curves(spec, GoalMetric(spec))
+    curves = Curves(GoalMetric(spec))
     ranges = [model.joint(name).range for name in spec.robot.joints if 'gripper_finger' in name]
     np.testing.assert_array_equal(ranges, [[0.0, 0.05]] * 2)
     simulation.reset(seed=0)
@@ -198,7 +198,7 @@ def test_fingers_are_comparable_with_the_command_of_the_gripper():
 
 def test_a_rotation_is_at_most_180_degrees():
     spec = TASKS['HandManipulateBlockFull']
-    curves, place = Curves(spec, GoalMetric(spec)), np.zeros(3)
+    curves, place = Curves(GoalMetric(spec)), np.zeros(3)
     for angle in np.radians([10.0, 170.0, 190.0, 268.0, 350.0]):
         pose = [np.cos(angle / 2.0), 0.0, 0.0, np.sin(angle / 2.0)]
         achieved, desired = np.r_[place, pose], np.r_[place, 1.0, 0.0, 0.0, 0.0]
