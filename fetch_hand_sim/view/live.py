@@ -22,11 +22,12 @@ from fetch_hand_sim.view.robot_watch import (
     ReplayWatch,
     RobotWatch,
     SeenTick,
+    spec_of,
     status_publishers,
 )
 from fetch_hand_sim.view.web import FOLLOWING, OVERLOOKING
 from msgs_spec.codecs import decode_status
-from msgs_spec.tasks import TaskSpec, task_spec
+from msgs_spec.tasks import TaskSpec
 from msgs_spec.tick import EpisodeStatus
 from msgs_spec.topics import DIAGNOSTICS, topic
 from node_runtime.diagnostics import (
@@ -151,7 +152,7 @@ class LiveRobot:
 
     def _on_status(self, status: EpisodeStatus) -> None:
         self._hear()
-        spec = task_spec(status.task, status.joint_prefix, status.control_hz)
+        spec = spec_of(status)
         if self._history is not None and self._history.metric.spec.name != spec.name:
             self._forget_requests()
         metric = GoalMetric(spec, success_rule=status.success_rule)

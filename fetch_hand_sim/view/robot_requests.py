@@ -98,9 +98,7 @@ class RemoteNode:
             self._asked[name] = future, time.monotonic()
             future.add_done_callback(answered)
 
-    def set_parameter(
-        self, name: str, value: str | int | float, then: Callable[[], None] | None = None
-    ) -> None:
+    def set_parameter(self, name: str, value: str | int | float, then: Callable[[], None]) -> None:
         """Set a parameter; call `then` if the node accepts the value, `notice` if it does not."""
         from rclpy.parameter import Parameter
 
@@ -108,10 +106,8 @@ class RemoteNode:
             result = response.results[0]
             if not result.successful:
                 self._notice(f'{self._name} refuses {name}: {result.reason}')
-            elif then is not None:
-                then()
             else:
-                self._notice(f'{name}: {value}')
+                then()
 
         parameter = Parameter(name, value=value).to_parameter_msg()
         self._call('set_parameters', _SET_PARAMETERS, {'parameters': [parameter]}, answered)
@@ -175,13 +171,10 @@ class RobotRequests:
         return self._policy.is_there()
 
     def take_task(self, spec: TaskSpec) -> None:
-        """Store the robot's task; a new one drops the user's goal and ends the page's commands."""
+        """Store the robot's task; a new one closes the publishers, whose types may differ."""
         if self._spec is not None and self._spec.name != spec.name:
-            self.forget_goal()
-            # Goals of another task may have another type.
             for name in list(self._publishers):
                 self._withdraw(name)
-            self._tell(is_commanding=False)
         self._spec = spec
 
     def forget_goal(self) -> None:

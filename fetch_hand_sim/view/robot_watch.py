@@ -18,7 +18,6 @@ from rclpy.node import Node, NodeNameNonExistentError
 from fetch_hand_sim.simulation.scene import Frame
 from msgs_spec.arrays import Array
 from msgs_spec.codecs import TopicCodec, decode_status
-from msgs_spec.robots import JOINT_PREFIX
 from msgs_spec.schemas import deserialize
 from msgs_spec.tasks import TASKS, TaskSpec, task_spec
 from msgs_spec.tick import EpisodeStatus, split_messages
@@ -108,12 +107,7 @@ class RobotWatch:
     @property
     def spec(self) -> TaskSpec | None:
         """The robot's task; None before the first status."""
-        return _spec_of(self.status) if self.status else None
-
-    @property
-    def joint_prefix(self) -> str:
-        """The prefix of the robot's joint names; the default prefix before the first status."""
-        return self.status.joint_prefix if self.status else JOINT_PREFIX
+        return spec_of(self.status) if self.status else None
 
     def _on_status_message(self, message: Any) -> None:
         """Handle an `episode_status` message, unless `latest_tick` delivers the same status."""
@@ -130,7 +124,7 @@ class RobotWatch:
 
     def _take_status(self, status: EpisodeStatus) -> None:
         if self._is_other(status):
-            self._follow(_spec_of(status))
+            self._follow(spec_of(status))
         self.status = status
         self._on_status(status)
         if status.phase == 'reset':
@@ -238,11 +232,12 @@ class RobotWatch:
 def _read_status(message: Any) -> EpisodeStatus:
     """Parse an `episode_status` message; ValueError if it is invalid or its task is unknown."""
     status = EpisodeStatus.from_values(decode_status(message))
-    _spec_of(status)
+    spec_of(status)
     return status
 
 
-def _spec_of(status: EpisodeStatus) -> TaskSpec:
+def spec_of(status: EpisodeStatus) -> TaskSpec:
+    """Return the task of a status, with its joint names and steps per episode."""
     return task_spec(status.task, status.joint_prefix, status.control_hz)
 
 

@@ -9,7 +9,7 @@ from typing import Any
 from rclpy.node import Node
 
 from fetch_hand_sim.simulation.scene import Scene
-from fetch_hand_sim.view.robot_watch import RobotWatch, SeenTick
+from fetch_hand_sim.view.robot_watch import RobotWatch, SeenTick, spec_of
 from fetch_hand_sim.visualization_node import NODE_NAME
 from fetch_hand_sim.visualization_node.messages import (
     Camera,
@@ -116,18 +116,17 @@ class VisualizationNode(Node):
         return bool(self._outputs[name].get_subscription_count())
 
     def _on_status(self, status: EpisodeStatus) -> None:
-        spec = self._watch.spec
-        assert spec is not None
+        spec = spec_of(status)
         # The URDF contains the names of the joints.
         robot = status.task, status.joint_prefix
         if robot != self._robot:
             self._robot = robot
-            self._begin(spec)
+            self._begin(spec, status.joint_prefix)
         if self._scalars is None or self._success_rule != status.success_rule:
             self._success_rule = status.success_rule
             self._scalars = Scalars(spec, status.success_rule)
 
-    def _begin(self, spec: TaskSpec) -> None:
+    def _begin(self, spec: TaskSpec, joint_prefix: str) -> None:
         """Begin to follow the robot of a task; publish its URDF and fixed transforms."""
         self._camera.close()
         self._latest = self._unmarked = self._undrawn = self._scalars = None
@@ -141,7 +140,7 @@ class VisualizationNode(Node):
             if source.name not in self._outputs:
                 self._open(source)
         self._listeners = SubscriberWatch(self, self._outputs.values())
-        urdf = self._transforms.description.to_xml(self._prefix, self._watch.joint_prefix)
+        urdf = self._transforms.description.to_xml(self._prefix, joint_prefix)
         description = self._outputs['robot_description']
         description.publish(description.msg_type(data=urdf))
         camera = view_transform(self._scene.view, self._prefix + _CAMERA_FRAME)

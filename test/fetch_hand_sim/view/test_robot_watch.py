@@ -82,7 +82,7 @@ def test_a_robot_that_comes_back_with_other_joint_names_is_followed(node, every_
             return any(np.array_equal(t.frame.joint_position, sent.get(t.stamp_ns)) for t in seen)
 
         act_until(node, tick, is_shown)
-        assert watch.joint_prefix == prefix
+        assert watch.status.joint_prefix == prefix
         robot.leave()
 
 
@@ -97,7 +97,7 @@ def test_a_robot_without_some_joints_and_success_is_shown(node, monkeypatch):
 
     monkeypatch.setattr(robot._runner, 'advance', without_base)
     act_until(node, lambda: robot.tick(lost=('is_success',)), lambda: seen)
-    assert watch.joint_prefix == JOINT_PREFIX
+    assert watch.status.joint_prefix == JOINT_PREFIX
     assert not seen[0].frame.is_success
     assert seen[0].frame.joint_position[:3].tolist() == [0.0] * 3
     assert np.isfinite(seen[0].frame.joint_position).all()
@@ -117,7 +117,7 @@ def test_a_tick_that_lost_its_first_message_does_not_pass_for_the_one_before(nod
                 rclpy.spin_once(node, timeout_sec=0.002)
 
     act_until(node, tick, lambda: len(seen) >= 40)
-    assert watch.joint_prefix == JOINT_PREFIX
+    assert watch.status.joint_prefix == JOINT_PREFIX
     for each in seen:
         tick, lost = sent[each.stamp_ns]
         assert np.array_equal(each.frame.achieved_goal, tick.achieved_goal)
