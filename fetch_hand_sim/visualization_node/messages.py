@@ -23,7 +23,6 @@ from fetch_hand_sim.view.robot_watch import SeenTick
 from fetch_hand_sim.visualization_node.transforms import Transform
 from msgs_spec.arrays import Array, Picture
 from msgs_spec.codecs import TopicCodec
-from msgs_spec.tasks import SuccessRule, TaskSpec
 from msgs_spec.topics import scalar_topics
 from node_runtime.diagnostics import Durations
 
@@ -146,14 +145,14 @@ def _scale(shape: Shape) -> Vector3:
 class Scalars:
     """Encodes the topics `scalars/*` of one task: distances to the goal, reward and success."""
 
-    def __init__(self, spec: TaskSpec, success_rule: SuccessRule) -> None:
-        self._metric = GoalMetric(spec, success_rule=success_rule)
-        self._codecs = {source.name: TopicCodec(source) for source in scalar_topics(spec)}
+    def __init__(self, metric: GoalMetric) -> None:
+        self.metric = metric
+        self._codecs = {source.name: TopicCodec(source) for source in scalar_topics(metric.spec)}
 
     def messages(self, tick: SeenTick) -> dict[str, bytes]:
         """Return CDR bytes by topic; at a reset, the topic of the reward is missing."""
         frame = tick.frame
-        distance, rotation = self._metric.distances(frame.achieved_goal, frame.desired_goal)
+        distance, rotation = self.metric.distances(frame.achieved_goal, frame.desired_goal)
         numbers = {
             'distance': float(distance),
             'rotation': float(rotation),

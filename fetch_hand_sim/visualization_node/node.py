@@ -8,6 +8,7 @@ from typing import Any
 
 from rclpy.node import Node
 
+from fetch_hand_sim.simulation.rewards import GoalMetric
 from fetch_hand_sim.simulation.scene import Scene
 from fetch_hand_sim.view.robot_watch import RobotWatch, SeenTick, spec_of
 from fetch_hand_sim.visualization_node import NODE_NAME
@@ -63,7 +64,6 @@ class VisualizationNode(Node):
         self._scene: Scene | None = None
         self._transforms: Transforms | None = None
         self._scalars: Scalars | None = None
-        self._success_rule = ''
         self._latest: SeenTick | None = None
         # The same tick until it is sent as markers and as a picture.
         self._unmarked: SeenTick | None = None
@@ -122,9 +122,9 @@ class VisualizationNode(Node):
         if robot != self._robot:
             self._robot = robot
             self._begin(spec, status.joint_prefix)
-        if self._scalars is None or self._success_rule != status.success_rule:
-            self._success_rule = status.success_rule
-            self._scalars = Scalars(spec, status.success_rule)
+        metric = GoalMetric(spec, success_rule=status.success_rule)
+        if self._scalars is None or self._scalars.metric != metric:
+            self._scalars = Scalars(metric)
 
     def _begin(self, spec: TaskSpec, joint_prefix: str) -> None:
         """Begin to follow the robot of a task; publish its URDF and fixed transforms."""

@@ -32,12 +32,10 @@ def tick_of(spec, reward):
 @each_task
 def test_a_tick_becomes_the_numbers_its_task_has(task, rule):
     spec = task_spec(task)
-    tick = tick_of(spec, reward=-0.25)
-    data = Scalars(spec, rule).messages(tick)
+    tick, metric = tick_of(spec, reward=-0.25), GoalMetric(spec, success_rule=rule)
+    data = Scalars(metric).messages(tick)
     assert list(data) == [source.name for source in scalar_topics(spec)]
-    distance, rotation = GoalMetric(spec, success_rule=rule).distances(
-        tick.frame.achieved_goal, tick.frame.desired_goal
-    )
+    distance, rotation = metric.distances(tick.frame.achieved_goal, tick.frame.desired_goal)
     wanted = {'reward': -0.25, 'is_success': 1.0, 'distance': distance, 'rotation': rotation}
     assert ('scalars/rotation' in data) == task.startswith('HandManipulate')
     assert ('scalars/distance' in data) == ('Rotate' not in task)
@@ -51,5 +49,5 @@ def test_a_tick_becomes_the_numbers_its_task_has(task, rule):
 
 def test_a_reset_has_no_reward():
     spec = task_spec('FetchPush')
-    data = Scalars(spec, 'gymnasium').messages(tick_of(spec, reward=None))
+    data = Scalars(GoalMetric(spec)).messages(tick_of(spec, reward=None))
     assert list(data) == ['scalars/distance', 'scalars/is_success']
