@@ -9,6 +9,7 @@ import numpy as np
 
 from fetch_hand_sim.simulation.scene import Frame, View
 from fetch_hand_sim.simulation.urdf import ROOT, Pose, RobotDescription
+from fetch_hand_sim.view.page.ray import camera_axes
 from msgs_spec.arrays import Array
 from msgs_spec.robots import FINGERTIPS
 from msgs_spec.rotations import IDENTITY
@@ -82,12 +83,8 @@ def frame_prefix(namespace: str) -> str:
 
 def view_transform(view: View, name: str) -> Transform:
     """Return the pose in the world of the camera frame `name` (x right, y down, z ahead)."""
-    azimuth, elevation = np.radians(view.azimuth), np.radians(view.elevation)
-    level = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
-    ahead = np.cos(elevation) * level + np.array([0.0, 0.0, np.sin(elevation)])
-    right = np.array([np.sin(azimuth), -np.cos(azimuth), 0.0])
-    matrix = np.stack([right, np.cross(ahead, right), ahead], axis=1)
+    ahead, right, up = camera_axes(view)
     quaternion = np.zeros(4)
-    mujoco.mju_mat2Quat(quaternion, matrix.ravel())
+    mujoco.mju_mat2Quat(quaternion, np.stack([right, -up, ahead], axis=1).ravel())
     position = np.array(view.lookat) - view.distance * ahead
     return Transform(ROOT, name, Pose(position, quaternion))

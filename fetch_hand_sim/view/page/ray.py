@@ -63,13 +63,18 @@ class Ray:
 
 def mouse_ray(camera: View | mujoco.MjvCamera, fovy: float, mouse: MousePlace) -> Ray:
     """Return the ray through the mouse; `fovy` is the vertical field of view, degrees."""
-    a, e = np.radians(camera.azimuth), np.radians(camera.elevation)
-    forward = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
-    right = np.array([np.sin(a), -np.cos(a), 0.0])
-    up = np.cross(right, forward)
+    forward, right, up = camera_axes(camera)
     half = np.tan(np.radians(fovy) / 2.0)
     x, y = (2.0 * mouse.x - 1.0) * half * mouse.aspect, (1.0 - 2.0 * mouse.y) * half
     direction = forward + x * right + y * up
     direction /= np.linalg.norm(direction)
     origin = np.array(camera.lookat) - camera.distance * forward
     return Ray(origin, direction, forward, right, up)
+
+
+def camera_axes(camera: View | mujoco.MjvCamera) -> tuple[Array, Array, Array]:
+    """Return unit vectors (3,) in the world: view direction, right and top of the picture."""
+    a, e = np.radians(camera.azimuth), np.radians(camera.elevation)
+    forward = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
+    right = np.array([np.sin(a), -np.cos(a), 0.0])
+    return forward, right, np.cross(right, forward)
