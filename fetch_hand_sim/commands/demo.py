@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Any
 
 from fetch_hand_sim.commands.node_processes import (
-    is_actor_shipped,
     open_log,
+    policy_or_default,
     start_nodes,
     stop_node,
 )
@@ -122,7 +122,8 @@ class Demo:
 
     def run(self, stop: StopSignals) -> int:
         """Run the demo; return its exit code."""
-        policy, exit_code = self._policy(), EXIT_FAILURE
+        policy = policy_or_default(self._options.policy, self._spec.name)
+        exit_code = EXIT_FAILURE
         watcher = Watcher(self._spec)
         try:
             _require_to_be_alone(watcher, stop)
@@ -157,14 +158,6 @@ class Demo:
                 return EXIT_FAILURE
         self._print_summary(time.monotonic() - began)
         return EXIT_SUCCESS
-
-    def _policy(self) -> str:
-        if self._options.policy:
-            return str(self._options.policy)
-        if is_actor_shipped(self._spec.name):
-            return self._spec.name
-        say(f'No actor is shipped for {self._spec.name} yet: commands are random.')
-        return 'random'
 
     def _sim_parameters(self) -> dict[str, object]:
         return {

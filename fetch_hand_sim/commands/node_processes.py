@@ -16,7 +16,7 @@ from importlib.metadata import PackageNotFoundError, distribution, entry_points
 from typing import IO
 
 from node_runtime import signals
-from node_runtime.command_line import EXIT_SUCCESS, CommandError, UsageError
+from node_runtime.command_line import EXIT_SUCCESS, CommandError, UsageError, say
 
 _DISTRIBUTION = 'fetch_hand_sim'
 _ACTORS = 'fetch_hand_sim.actors'
@@ -50,6 +50,14 @@ def is_actor_shipped(task: str) -> bool:
     actors of its package by task.
     """
     return any(task in point.load()() for point in entry_points(group=_ACTORS))
+
+
+def policy_or_default(policy: str, task: str) -> str:
+    """Return `policy`; if empty, the shipped actor of a task, or `random` with a printed line."""
+    if policy or is_actor_shipped(task):
+        return policy or task
+    say(f'No actor is shipped for {task} yet: commands are random.')
+    return 'random'
 
 
 def open_log(name: str) -> IO[str]:

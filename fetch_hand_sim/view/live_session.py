@@ -16,8 +16,8 @@ import rclpy
 from rclpy.node import Node
 
 from fetch_hand_sim.commands.node_processes import (
-    is_actor_shipped,
     open_log,
+    policy_or_default,
     start_nodes,
     stop_node,
 )
@@ -161,10 +161,7 @@ def _no_robot(node: Node) -> str:
 
 
 def _start(options: argparse.Namespace, node: Node, log: IO[str]) -> Nodes:
-    policy = options.policy or options.task
-    if not options.policy and not is_actor_shipped(options.task):
-        print(f'No actor is shipped for {options.task} yet: commands are random.', flush=True)
-        policy = 'random'
+    policy = policy_or_default(options.policy, options.task)
     settings: dict[str, object] = {'task': options.task, 'wait_for_commands': True}
     if options.episode_dir:
         settings['episode_dir'] = options.episode_dir
@@ -173,7 +170,7 @@ def _start(options: argparse.Namespace, node: Node, log: IO[str]) -> Nodes:
         settings['publish_clock'] = False
     # The namespace may come from `--robot` or from `--ros-args`.
     nodes: dict[str, dict[str, object]] = {
-        'policy_node': {'policy': str(policy), 'trust': options.trust},
+        'policy_node': {'policy': policy, 'trust': options.trust},
         'sim_node': settings,
     }
     return dict(zip(nodes, start_nodes(nodes, log, node.get_namespace()), strict=True))
@@ -186,16 +183,10 @@ def check_alive(nodes: Nodes, log: IO[str]) -> None:
         if code is not None:
             lines = Path(log.name).read_text(errors='replace').strip().splitlines()[-_LAST_LINES:]
             output = f': {" / ".join(lines)}' if lines else ''
-            raise NodeFailure(f'{name} {_cause(code)}{output}')
-
-
-def _cause(code: int) -> str:
-    if code >= 0:
-        return f'ended with exit code {code}'
-    try:
-        return f'was killed by {signal.Signals(-code).name}'
-    except ValueError:
-        return f'was killed by signal {-code}'
+            cause = f'ended with exit code {code}'
+            if code < 0:
+                cause = f'was killed by {signal.Signals(-code).name}'
+            raise NodeFailure(f'{name} {cause}{output}')
 
 
 def _give_way() -> None:
