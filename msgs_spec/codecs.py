@@ -340,7 +340,8 @@ class TopicCodec:
         """
         if messages.ndim != 2 or messages.shape[1] != self.size:
             raise LayoutError(f'{self.topic.name}: {messages.shape[-1]} bytes, not {self.size}')
-        if not all(_equal(messages[:, run], fixed) for run, fixed in self._fixed):
+        template = np.frombuffer(self._template, np.uint8)
+        if any((messages[:, run] != template[run]).any() for run, _ in self._fixed):
             raise LayoutError(f'{self.topic.name}: not the layout of this project')
         stamps = np.zeros(len(messages), dtype=np.int64)
         if self._has_stamp:
@@ -403,7 +404,3 @@ class CommandCodec:
             checked_size(self._topic, values).astype('<f8').tobytes()
         )
         return bytes(data)
-
-
-def _equal(messages: NDArray[np.uint8], expected: bytes) -> bool:
-    return bool((messages == np.frombuffer(expected, np.uint8)).all())
