@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 from fetch_hand_sim.episodes.recorder import EpisodeRecorder
 from fetch_hand_sim.sim_node.graph_watch import GraphWatch
-from fetch_hand_sim.sim_node.robot import Messages, Robot
+from fetch_hand_sim.sim_node.robot import Robot
+from fetch_hand_sim.sim_node.schedule import Messages
 from msgs_spec.codecs import TopicCodec
 from msgs_spec.topics import DIAGNOSTICS, REAL_TIME_FACTOR
 from node_runtime.diagnostics import (

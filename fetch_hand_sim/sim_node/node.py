@@ -23,8 +23,8 @@ from fetch_hand_sim.episodes.runner import EpisodeRunner
 from fetch_hand_sim.sim_node import NODE_NAME
 from fetch_hand_sim.sim_node.graph_watch import GraphWatch
 from fetch_hand_sim.sim_node.health import WAITING_PERIOD, Health
-from fetch_hand_sim.sim_node.robot import Messages, Receivers, Robot
-from fetch_hand_sim.sim_node.schedule import LatestTick, TickSchedule
+from fetch_hand_sim.sim_node.robot import Receivers, Robot
+from fetch_hand_sim.sim_node.schedule import LatestTick, Messages, TickSchedule
 from fetch_hand_sim.sim_node.services import open_services
 from fetch_hand_sim.simulation import Simulation
 from msgs_spec.disturbances import read_disturbances

@@ -12,14 +12,12 @@ from typing import Any
 from fetch_hand_sim.episodes.command_buffer import CommandBuffer
 from fetch_hand_sim.episodes.recorder import EpisodeRecorder
 from fetch_hand_sim.episodes.runner import EpisodeRunner, accept_goal, accept_perturbation
-from fetch_hand_sim.sim_node.schedule import TickSchedule
+from fetch_hand_sim.sim_node.schedule import Messages, TickSchedule
 from msgs_spec.codecs import answered_stamp, decode_status
 from msgs_spec.schemas import deserialize, require_short, serialize
 from msgs_spec.tick import Tick, TickEncoder
 from msgs_spec.topics import MAX_STEPS, TopicSpec
 from node_runtime.diagnostics import Durations
-
-Messages = list[tuple[TopicSpec, bytes]]
 
 # Seconds within which a policy answers a tick.
 _ANSWER_TIME = 0.2

@@ -137,7 +137,7 @@ def describe(path: Path) -> str:
     name = path.name.removesuffix('.mcap')
     try:
         outcome = read_summary(path).outcome
-    except (EpisodeReadError, ValueError):
+    except EpisodeReadError:
         return f'{name}  unreadable'
     if not outcome.is_complete:
         return f'{name}  interrupted'
