@@ -79,16 +79,6 @@ class Address:
         )
 
 
-@dataclass(frozen=True, slots=True)
-class Touch:
-    """Input in one frame: mouse (pixels), wheel movement, any button held, any text field used."""
-
-    mouse: tuple[float, float] = (0.0, 0.0)
-    wheel: float = 0.0
-    is_down: bool = False
-    is_typing: bool = False
-
-
 class FrameRate:
     """Decides when the next frame begins. Times are seconds of one steady clock.
 
@@ -101,19 +91,18 @@ class FrameRate:
 
     def __init__(self, period: Callable[[], float] = lambda: FOLLOWING) -> None:
         self.period = period
-        self._touch = Touch()
+        self._mouse = (0.0, 0.0)
         self._touched = 0.0
         self._began = 0.0
 
-    def wait_time(self, now: float, touch: Touch) -> float:
+    def wait_time(self, now: float, mouse: tuple[float, float], is_held: bool) -> float:
         """Return the seconds to wait before the next frame; call it once per frame.
 
-        `touch` is the mouse, wheel and keyboard input at the time `now`.
+        `mouse` is its position at the time `now`; `is_held` means other input, such as a button.
         """
-        is_held = touch.is_down or touch.is_typing or touch.wheel != 0.0
-        if is_held or touch.mouse != self._touch.mouse:
+        if is_held or mouse != self._mouse:
             self._touched = now
-        self._touch = touch
+        self._mouse = mouse
         wait = 0.0
         if now - self._touched > _ATTENTION:
             wait = max(0.0, self._began + self.period() - now)
@@ -128,7 +117,10 @@ class _Viewer(web_viewer.WebViewer):
 
     def prepare_next_frame(self) -> bool:
         """Wait until the next frame is due and begin it; return False if the page disconnected."""
-        time.sleep(self.frame_rate.wait_time(time.monotonic(), _read_touch()))
+        io = imgui.GetIO()
+        is_held = imgui.IsAnyMouseDown() or io.WantCaptureKeyboard or io.MouseWheel != 0.0
+        mouse = (io.MousePos.x, io.MousePos.y)
+        time.sleep(self.frame_rate.wait_time(time.monotonic(), mouse, is_held))
         begun: bool = super().prepare_next_frame()
         return begun
 
@@ -141,16 +133,6 @@ class _Viewer(web_viewer.WebViewer):
     def get_drop_file(self) -> str:
         """Return '', so that a file dropped on the page is ignored."""
         return ''
-
-
-def _read_touch() -> Touch:
-    io = imgui.GetIO()
-    return Touch(
-        mouse=(io.MousePos.x, io.MousePos.y),
-        wheel=io.MouseWheel,
-        is_down=imgui.IsAnyMouseDown(),
-        is_typing=io.WantCaptureKeyboard,
-    )
 
 
 def _outside_host() -> str:
