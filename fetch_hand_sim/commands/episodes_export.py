@@ -90,7 +90,6 @@ def _run(options: argparse.Namespace) -> int:
                 advance(1)
     for reason in skipped:
         complain(_NAME, f'skipped {reason}')
-    by_task = {task: episodes for task, episodes in by_task.items() if episodes}
     if not by_task and skipped:
         return EXIT_USAGE
     if not by_task:
@@ -123,10 +122,9 @@ def _add(path: Path, by_task: dict[str, list[EpisodeArrays]], options: argparse.
     if not is_wanted(options, summary.metadata.get('task'), summary):
         return False
     episode = load_episode(path)
-    others = by_task.setdefault(episode.spec.name, [])
-    if why := _why_left_out(episode, others, options.to):
+    if why := _why_left_out(episode, by_task.get(episode.spec.name, []), options.to):
         raise EpisodeReadError(f'{path}: {why}')
-    others.append(episode)
+    by_task.setdefault(episode.spec.name, []).append(episode)
     return True
 
 
