@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fetch_hand_sim.view.page.command_panel import Teleoperation, is_move
+from fetch_hand_sim.view.page.command_panel import Teleoperation
 from msgs_spec.robots import FETCH, SHADOW_HAND
 
 FRAME = 1.0 / 60.0
@@ -55,8 +55,3 @@ def test_choosing_wraps_around(robot):
     assert keys.selected == len(robot.command) - 1
     keys.select(1)
     assert keys.selected == 0
-
-
-def test_fetch_alone_is_told_how_far_to_go():
-    assert [is_move(part) for part in FETCH.command] == [True, True, True, False]
-    assert not any(is_move(part) for part in SHADOW_HAND.command)
