@@ -9,7 +9,7 @@ import sys
 
 import pytest
 
-from fetch_hand_sim.commands.node_processes import executable, is_actor_shipped
+from fetch_hand_sim.commands.node_processes import executable, policy_or_default
 
 
 def test_an_executable_runs_with_its_exit_code_and_no_python_file_of_its_folder(tmp_path):
@@ -54,6 +54,9 @@ def test_an_executable_whose_parent_has_ended_does_not_start(tmp_path):
         assert subprocess.run(command, capture_output=True).returncode == code
 
 
-def test_shipped_actors_are_found_by_task():
-    assert is_actor_shipped('FetchReach')
-    assert not is_actor_shipped('SomebodysTask')
+def test_the_default_policy_is_the_shipped_actor_or_random(capsys):
+    assert policy_or_default('mine.onnx', 'SomebodysTask') == 'mine.onnx'
+    assert policy_or_default('', 'FetchReach') == 'FetchReach'
+    assert capsys.readouterr().out == ''
+    assert policy_or_default('', 'SomebodysTask') == 'random'
+    assert 'No actor is shipped for SomebodysTask' in capsys.readouterr().out
