@@ -45,17 +45,15 @@ class Curves:
         distance, rotation = self._metric.distances(frame.achieved_goal, frame.desired_goal)
         # The reference's angle between q and -q is 2 pi; the page shows the shorter way.
         rotation = np.minimum(rotation, 2.0 * np.pi - rotation)
-        values = np.full((2, len(self._commanded)), np.nan)
-        if command is not None:
-            values[0] = command
-        values[1] = self._positions(frame)
+        if command is None:
+            command = np.full(len(self._commanded), np.nan)
         first = [time, distance, rotation, np.nan if reward is None else reward]
-        self._rows.append(np.concatenate([first, *values]))
+        self._rows.append(np.concatenate([first, command, self._positions(frame)]))
 
     def graphs(self, ticks: int | None = None) -> Graphs:
         """Return the curves of the oldest `ticks` stored ticks; None returns all."""
         spec, commands = self._metric.spec, len(self._commanded)
-        rows = np.concatenate([[], *self._rows]).reshape(-1, 4 + 2 * commands)[:ticks]
+        rows = np.array(self._rows).reshape(-1, 4 + 2 * commands)[:ticks]
 
         def series(columns: int | slice) -> Series:
             return Series(rows[:, 0], rows[:, columns])
