@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from io import BytesIO
 from typing import Any, Literal
 
 import numpy as np
@@ -232,11 +233,11 @@ def join_messages(messages: Sequence[tuple[TopicSpec, bytes]]) -> bytes:
 def split_messages(data: bytes) -> dict[str, bytes]:
     """Return the CDR bytes of each topic in a `latest_tick`; ValueError if sizes are wrong."""
     message = deserialize(LATEST_TICK.type_name, data)
-    rest, parts = bytes(message.data), {}
+    stream, parts = BytesIO(bytes(message.data)), {}
     for part in message.layout.dim:
-        if part.size > len(rest):
-            raise ValueError(f'{part.label!r} has {len(rest)} bytes left, not {part.size}')
-        parts[part.label], rest = rest[: part.size], rest[part.size :]
-    if rest:
+        parts[part.label] = found = stream.read(part.size)
+        if len(found) < part.size:
+            raise ValueError(f'{part.label!r} has {len(found)} bytes left, not {part.size}')
+    if rest := stream.read():
         raise ValueError(f'{len(rest)} bytes belong to no topic')
     return parts
