@@ -334,6 +334,9 @@ def _parsed(text: str) -> Any:
         import yaml
 
         try:
+            if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text)):
+                # Nested aliases would make gigabytes of a short text.
+                raise ValueError('aliases are not allowed')
             return yaml.safe_load(text)
         except Exception as error:  # PyYAML raises unrelated types, such as KeyError for `!!bool x`
             raise ValueError(f'neither JSON nor YAML: {one_line(error)}') from None

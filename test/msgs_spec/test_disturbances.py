@@ -53,6 +53,7 @@ def test_scaling_follows_the_meaning_of_a_field() -> None:
         ('{"physics": 3}', "'3'"),
         ('{broken', 'JSON'),
         ('{action: !!bool x}', 'YAML'),
+        ('{action: {latency: [&a [1, 2], *a]}}', 'aliases are not allowed'),
         # A regular file whose first bytes cannot be read.
         ('/proc/self/mem', '/proc/self/mem: Input/output error'),
     ],
