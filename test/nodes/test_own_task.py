@@ -59,9 +59,10 @@ def test_the_pages_command_lines_are_understood(site: Path) -> None:
     page = (ROOT / 'docs' / 'own_task.md').read_text()
     lines = [words for line in shell_lines(page) for words in commands(line)]
     (training,) = [words for words in lines if words[:2] == ['fetch_hand_sim', 'train']]
-    # Arguments before `--help` are checked before the help is printed.
-    result = run(site, '-m', *training, '--help')
-    assert result.returncode == 0, result.stderr
+    for command in (training, ['fetch_hand_sim', 'benchmark', '--tasks', TASK]):
+        # Arguments before `--help` are checked before the help is printed.
+        result = run(site, '-m', *command, '--help')
+        assert result.returncode == 0, result.stderr
     (node,) = [words for words in lines if words[0] == 'sim_node']
     assert node[1:] == ros_args(task=TASK)
 
