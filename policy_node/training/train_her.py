@@ -146,6 +146,7 @@ def _read_experience(config: TrainConfig, directory: Path | None) -> Episodes | 
         ),
         'longest_hold above 1': (config.longest_hold > 1, 'logged actions have no length'),
         'subgoal_every': (config.subgoal_every > 0, 'logged episodes have no subgoals'),
+        'past_actions': (config.past_actions > 0, 'logged observations have no past actions'),
         'gamble': (config.gamble, 'in logged episodes gambles end nothing'),
     }
     for name, (is_set, why) in excluded.items():

@@ -10,6 +10,8 @@ import torch
 from numpy.typing import NDArray
 
 from fetch_hand_sim.simulation import Simulation
+from msgs_spec.arrays import Array32
+from policy_node.policies.policy import past_after
 from policy_node.training.configuration.config import changed_fields
 from policy_node.training.configuration.flat import changed, config_from_dict
 from policy_node.training.evaluation import FIRST_SEED
@@ -78,9 +80,12 @@ def _play(
     """Run an episode in each simulation; return critic values and rewards (ticks, episodes)."""
     count = simulation.num_envs
     observation = simulation.reset(seed=[FIRST_SEED + index for index in range(count)])
+    past = np.zeros((count, learner.actor.shape.past_size), np.float32)
     values, rewards = [], []
     for _ in range(simulation.spec.episode_ticks):
-        value, action = _judge(learner, observation['observation'], observation['desired_goal'])
+        seen = np.concatenate([observation['observation'], past], axis=1)
+        value, action = _judge(learner, seen, observation['desired_goal'])
+        past = past_after(past, action)
         observation = simulation.step(action).observation
         goals = observation['achieved_goal'], observation['desired_goal']
         values.append(value)
@@ -90,19 +95,19 @@ def _play(
 
 @torch.no_grad()
 def _judge(
-    learner: ActorCritic, observation: NDArray[np.float64], goal: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    learner: ActorCritic, seen: NDArray[np.float64], goal: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], Array32]:
     """Return the critic's values (episodes,) of the actor's actions, and these actions.
 
-    Actions are (episodes, action size), without noise.
+    `seen` are observations with past actions, (episodes, input size). Actions are (episodes, action
+    size), without noise.
     """
-    seen, wanted = (learner.tensor(values).float() for values in (observation, goal))
-    features = learner.actor.features(seen, wanted)
+    features = learner.actor.features(*(learner.tensor(each).float() for each in (seen, goal)))
     action = learner.actor(features)
     value = learner.critic(features, action)
     if value.ndim > 1:
         value = value.mean(dim=0)
-    return value.double().numpy(), action.double().numpy()
+    return value.double().numpy(), action.numpy()
 
 
 def discounted(rewards: NDArray[np.float64], gamma: float) -> NDArray[np.float64]:

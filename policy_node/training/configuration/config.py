@@ -607,8 +607,8 @@ def _rules(config: TrainConfig, spec: TaskSpec) -> Iterator[tuple[bool, str]]:
     yield bool(c.init_from and unusual), f'init_from excludes {", ".join(unusual)}'
     yield len(chosen) > 1, f'{" excludes ".join(chosen)}'
     yield (
-        c.past_actions > 0 and (c.longest_hold > 1 or c.parameter_noise),
-        'past_actions needs longest_hold=1 and parameter_noise=False',
+        c.past_actions > 0 and (c.longest_hold > 1 or c.parameter_noise or c.subgoal_every > 0),
+        'past_actions needs longest_hold=1, parameter_noise=False and subgoal_every=0',
     )
     yield (
         0.0 < c.noise_seconds * c.control_hz < 1.0 - 1e-6,

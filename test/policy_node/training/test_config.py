@@ -158,6 +158,7 @@ def test_bad_assignments_are_refused(text, match):
         ({'noise_seconds': 0.01}, 'noise_seconds 0.01 is less than a tick of 0.04 s'),
         ({'longest_hold': 5, 'noise_seconds': 0.04}, 'longest_hold .* excludes noise_seconds'),
         ({'past_actions': 3, 'longest_hold': 5}, 'past_actions needs longest_hold=1'),
+        ({'past_actions': 3, 'subgoal_every': 9}, 'past_actions needs .* subgoal_every=0'),
         ({'advantage': True, 'discount': 'time', 'critics': 2}, 'advantage True .* one critic'),
         ({'subgoal_every': 51}, 'subgoal_every 51 is longer than an episode'),
         ({'subgoal_every': 9, 'n_step': 3}, 'n_step 3 has no effect: it needs .* no subgoal_every'),

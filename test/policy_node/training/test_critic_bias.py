@@ -47,10 +47,12 @@ def test_a_critic_that_overestimates_is_shown(tmp_path, capsys):
     assert 'correlation' in capsys.readouterr().out
 
 
-@pytest.mark.parametrize('critics', [1, 2])
-def test_quantiles_have_the_value_of_their_mean(tmp_path, critics):
-    many = {'quantiles': 5, 'critics': critics, 'aggregate': 'truncated'}
-    run = saved_run(tmp_path, value=-3.0, **many)
+MANY = {'quantiles': 5, 'aggregate': 'truncated'}
+
+
+@pytest.mark.parametrize('changes', [MANY, MANY | {'critics': 2}, {'past_actions': 2}], ids=str)
+def test_values_are_read_from_other_networks(tmp_path, changes):
+    run = saved_run(tmp_path, value=-3.0, **changes)
     assert [each.value for each in measure(run, episodes=2)] == pytest.approx([-3.0] * 3)
 
 

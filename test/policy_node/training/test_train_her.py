@@ -391,6 +391,7 @@ def test_two_workers_agree():
         ('--task FetchReach --set gamma=.9 --gamma .95', '--gamma 0.95 excludes --set gamma=0.9'),
         ('--task FetchReach --replay-transitions 1000 --learning-starts 1001', '1001 or more'),
         (f'{PPO} --task FetchReach --from-episodes .', 'ppo excludes --from-episodes'),
+        ('--task FetchReach --past-actions 2 --from-episodes .', 'past_actions excludes --'),
         ('--recipe robust --task FetchReach --from-episodes .', 'imitation excludes --from-epis'),
         ('--resume nowhere', 'nowhere has no training_state.safetensors'),
     ],
