@@ -46,8 +46,8 @@ def main() -> int:
     torch.manual_seed(0)
     learner, experience = _learner_of(options.random)
     for _ in range(UPDATES):
-        learner.importance(experience.batch(0))
-    batches = [experience.batch(0) for _ in range(MEASURED)]
+        learner.importance(experience.batch())
+    batches = [experience.batch() for _ in range(MEASURED)]
     weight = np.concatenate([learner.importance(batch) for batch in batches])
     kind = np.concatenate([_kind(batch) for batch in batches])
     _print(weight, kind)

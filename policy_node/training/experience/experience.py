@@ -139,12 +139,8 @@ class Experience:
         """Set the reward thresholds for `progress`, the finished share 0 ... 1 of the run."""
         self._sampler = self._sampler.at(progress)
 
-    def batch(self, env_steps: int) -> Transitions:
-        """Draw the transitions for one update and relabel their goals.
-
-        `env_steps` is the number of environment steps so far. Only subclasses use it.
-        """
-        del env_steps
+    def batch(self) -> Transitions:
+        """Draw the transitions for one update and relabel their goals."""
         return self._draw(self.mixture())
 
     def _draw(

@@ -52,6 +52,13 @@ Weigh = Callable[[Episodes], NDArray[np.float64]]
 """A function that returns the weight of each episode, (episodes,)."""
 
 
+def has_moved(episodes: Episodes) -> NDArray[np.float64]:
+    """Return (episodes,): 1 if the achieved goal left its start by > `MOVED_DISTANCE`, else 0."""
+    offset = episodes.achieved_goal - episodes.achieved_goal[:, :1]
+    moved = np.square(offset).sum(axis=-1).max(axis=-1) > MOVED_DISTANCE**2
+    return np.asarray(moved, dtype=np.float64)
+
+
 class EpisodeReplay:
     """Ring buffer of the newest episodes, in arrays that are allocated once.
 
@@ -60,12 +67,9 @@ class EpisodeReplay:
     Args:
         capacity: Largest number of episodes.
         ticks: Steps per episode.
-        weigh: Function that returns the weight of each episode for `draw`; None means `has_moved`.
+        weigh: Function that returns the weight of each episode for `draw`.
         count_ticks: Function that returns how many steps at the start of each episode are valid,
             (episodes,). Learning uses only valid steps. None makes all valid.
-
-    Attributes:
-        last_added: Number of episodes that the last call of `add` stored.
     """
 
     def __init__(
@@ -75,7 +79,7 @@ class EpisodeReplay:
         observation_size: int,
         goal_size: int,
         action_size: int,
-        weigh: Weigh | None = None,
+        weigh: Weigh = has_moved,
         count_ticks: Callable[[Episodes], NDArray[np.int64]] | None = None,
     ) -> None:
         if capacity < 1:
@@ -86,14 +90,13 @@ class EpisodeReplay:
             desired_goal=np.zeros((capacity, goal_size), np.float32),
             action=np.zeros((capacity, ticks, action_size), np.float32),
         )
-        self._weigh = weigh or has_moved
+        self._weigh = weigh
         self._count_ticks = count_ticks
         self._weights = np.zeros(capacity)
         self._valid = np.full(capacity, ticks)
         # Cumulative sums over rows: valid ticks, and weights times valid ticks.
         self._ticks_up_to, self._weight_up_to = np.zeros(0), np.zeros(0)
         self.capacity = capacity
-        self.last_added = 0
         self._size = 0
         self._next = 0
 
@@ -139,7 +142,6 @@ class EpisodeReplay:
         self._weights[rows] = self._weigh(episodes)
         if self._count_ticks is not None:
             self._valid[rows] = self._count_ticks(episodes)
-        self.last_added = len(episodes)
         self._next = int((self._next + len(episodes)) % self.capacity)
         self._size = min(self._size + len(episodes), self.capacity)
         valid = self._valid[: self._size] / self.ticks
@@ -180,13 +182,6 @@ def draw_by(sums: Array, count: int, generator: np.random.Generator) -> NDArray[
     last = np.searchsorted(sums, sums[-1])
     row = np.searchsorted(sums, sums[-1] * generator.random(count), 'right')
     return np.asarray(np.minimum(row, last))
-
-
-def has_moved(episodes: Episodes) -> NDArray[np.float64]:
-    """Return (episodes,): 1 if the achieved goal left its start by > `MOVED_DISTANCE`, else 0."""
-    offset = episodes.achieved_goal - episodes.achieved_goal[:, :1]
-    moved = np.square(offset).sum(axis=-1).max(axis=-1) > MOVED_DISTANCE**2
-    return np.asarray(moved, dtype=np.float64)
 
 
 @dataclass(frozen=True, slots=True)

@@ -250,9 +250,8 @@ class SubgoalSampler(TransitionSampler):
 class HierarchicalExperience(Experience):
     """Batches of both levels from one replay; arguments as `Experience`."""
 
-    def batch(self, env_steps: int) -> HierarchicalTransitions:
-        """Draw the transitions of one update of both levels; `env_steps` is unused."""
-        del env_steps
+    def batch(self) -> HierarchicalTransitions:
+        """Draw the transitions of one update of both levels."""
         config, mixture = self.config, self.mixture()
         low = self._draw(with_subgoals(mixture))
         subgoals = SubgoalSampler(

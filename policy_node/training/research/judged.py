@@ -150,7 +150,6 @@ class JudgedExperience(Experience):
         super().narrow(progress)
         self.judged = self.judged.at(progress)
 
-    def batch(self, env_steps: int) -> Transitions:
-        """Draw the transitions for one update from `judged`; `env_steps` is not used."""
-        del env_steps
+    def batch(self) -> Transitions:
+        """Draw the transitions for one update from `judged`."""
         return self._draw(self.mixture(), self.judged)

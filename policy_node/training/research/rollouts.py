@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 from fetch_hand_sim.simulation.rewards import GoalMetric
 from msgs_spec.arrays import Array, Array32
 from msgs_spec.tasks import TaskSpec
+from policy_node.policies.actor import Actor
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.experience.experience import Experience
 from policy_node.training.experience.hindsight import (
@@ -46,7 +47,6 @@ from policy_node.training.experience.replay import (
     Transitions,
     Weigh,
     draw_by,
-    has_moved,
 )
 from policy_node.training.experience.sampling import TransitionSampler
 from policy_node.training.machine import Workers
@@ -264,24 +264,31 @@ class OnPolicyExperience(Experience):
         generator: np.random.Generator,
         critique: PPO,
         metric: GoalMetric,
-        weigh: Weigh = has_moved,
+        weigh: Weigh,
     ) -> None:
         super().__init__(config, spec, workers, sampler, generator, weigh=weigh)
         limits = config.gamma, config.trace, config.importance == 'decision'
         self._maker = RolloutMaker(critique, sampler.compute_reward, *limits)
         self._metric = metric
-        self._newest = workers.share(config.num_envs)
+        self._newest = self.replay.episodes
         self._rollouts: RolloutTransitions | None = None
-        self._made_after = -1
         self._weight_up_to = np.zeros(0)
 
-    def batch(self, env_steps: int) -> Transitions:
-        """Draw transitions of the newest cycle; a new number of `env_steps` marks a new cycle."""
-        if self._rollouts is None or env_steps != self._made_after:
-            self._rollouts, self._made_after = self._roll_out(), env_steps
+    def normalize(self, episodes: Episodes, actor: Actor) -> None:
+        """Normalize as `Experience` does; draw later batches from `episodes`, unless it is empty.
+
+        Episodes of earlier cycles are of another actor.
+        """
+        super().normalize(episodes, actor)
+        if len(episodes):
+            self._newest, self._rollouts = episodes, None
+
+    def batch(self) -> Transitions:
+        """Draw transitions of the newest cycle."""
+        # Only the first update of a cycle knows the actor that collected it.
+        rollouts = self._rollouts = self._rollouts or self._roll_out()
         row, ticks = self._draw_rows(), self.replay.ticks
         drawn = row * ticks + self.generator.integers(ticks, size=len(row))
-        rollouts = self._rollouts
         return RolloutTransitions(
             **{each.name: getattr(rollouts, each.name)[drawn] for each in fields(rollouts)}
         )
@@ -306,9 +313,7 @@ class OnPolicyExperience(Experience):
         return found
 
     def _roll_out(self) -> RolloutTransitions:
-        # Fewer episodes if a simulation diverged: older ones are of another actor.
-        episodes = self.replay.newest(min(self._newest, self.replay.last_added))
-        mixture = super().mixture()
+        episodes, mixture = self._newest, super().mixture()
         mixture.pop('real', None)
         copies, outcomes = self.config.hindsight_k if mixture else 0, None
         if _OUTCOME in mixture:

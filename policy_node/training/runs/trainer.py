@@ -434,10 +434,9 @@ class Trainer(BaseTrainer):
         first = min(first, self.experience.replay.capacity * self.spec.episode_ticks)
         if self.workers.any(self.experience.transitions < max(first, 1)):
             return []
-        steps = self.counters.env_steps
         self.learner.set_progress(self._progress())
         losses = [
-            self.learner.update(self.experience.batch(steps))
+            self.learner.update(self.experience.batch())
             for _ in range(self.config.updates_per_cycle)
         ]
         self.learner.average()

@@ -236,7 +236,7 @@ def test_a_share_of_a_batch_is_from_episodes_that_moved_the_object(share: float)
     config = recipe_config('FetchPush', 'best', **ON_POLICY, moved_share=share, batch_size=4000)
     spec, generator = task_spec('FetchPush'), np.random.default_rng(0)
     cpu = torch.device('cpu')
-    _, experience = make_learner(config, GoalMetric(spec), cpu, Workers(), generator)
+    learner, experience = make_learner(config, GoalMetric(spec), cpu, Workers(), generator)
     count, ticks = config.num_envs, spec.episode_ticks
     observation = np.zeros((count, ticks + 1, spec.observation_size), np.float32)
     observation[:, :, 0] = np.arange(count)[:, None]
@@ -244,8 +244,8 @@ def test_a_share_of_a_batch_is_from_episodes_that_moved_the_object(share: float)
     moved = np.array([2, 5])
     achieved[moved, 20:] = 0.1
     goal, action = np.ones((count, 3), np.float32), np.zeros((count, ticks, 4), np.float32)
-    experience.replay.add(Episodes(observation, achieved, goal, action))
-    drawn = experience.batch(0).observation[:, 0]
+    experience.normalize(Episodes(observation, achieved, goal, action), learner.actor)
+    drawn = experience.batch().observation[:, 0]
     found = np.isin(drawn, moved).mean()
     assert found == pytest.approx(share + (1 - share) * 2 / count, abs=0.03)
     assert set(drawn) >= set(moved)

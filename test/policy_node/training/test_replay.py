@@ -145,7 +145,7 @@ def test_a_batch_follows_the_configuration():
     parts = sampler, np.random.default_rng(0)
     experience = Experience(config, PEN, Workers(), *parts)
     experience.replay.add(episodes)
-    batch = experience.batch(env_steps=0)
+    batch = experience.batch()
     assert set(batch.observation[:, -7]) == {1.0}
     assert set(batch.observation[:, 0]) == set(range(21))
     assert has_moved(episodes).tolist() == [0.0, 1.0, 0.0]

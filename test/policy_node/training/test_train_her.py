@@ -228,7 +228,7 @@ def test_thresholds_of_training_narrow_and_may_be_several(tmp_path, changes, thr
     trainer.experience.replay.add(trainer.collector.collect(RandomPolicy(4))[0])
     for env_steps, limits in zip(range(0, 4_000, 1_000), thresholds, strict=False):
         trainer.experience.narrow(env_steps / 3_000)
-        batch = trainer.experience.batch(env_steps)
+        batch = trainer.experience.batch()
         position = batch.next_observation[:, :3].astype(np.float64)
         distance = np.linalg.norm(position - batch.goal, axis=-1)
         met = np.mean([distance < limit for limit in limits], axis=0)
