@@ -110,11 +110,12 @@ class Collector:
         """
         simulation = self.simulation
         spec = simulation.spec
-        ticks, count, inputs = spec.episode_ticks, simulation.num_envs, self._past_size
+        ticks, count = spec.episode_ticks, simulation.num_envs
+        inputs = spec.observation_size + self._past_size
         observation = simulation.reset(seed=self._seeds)
         self._seeds = None
         episodes = Episodes(
-            observation=np.empty((count, ticks + 1, spec.observation_size + inputs), np.float32),
+            observation=np.empty((count, ticks + 1, inputs), np.float32),
             achieved_goal=np.empty((count, ticks + 1, spec.goal.size), np.float32),
             desired_goal=observation['desired_goal'].astype(np.float32),
             action=np.empty((count, ticks, self._columns), np.float32),
@@ -129,8 +130,7 @@ class Collector:
             action = self._explore(acting, observation, past, tick)
             episodes.action[:, tick] = action
             result = simulation.step(action[:, : self._action_size])
-            if self._past_size:
-                past = past_after(past, action[:, : self._action_size])
+            past = past_after(past, action[:, : self._action_size])
             observation, success = result.observation, result.success
             whole &= ~result.diverged
         episodes.observation[:, ticks] = np.concatenate([observation['observation'], past], 1)

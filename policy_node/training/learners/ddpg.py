@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from msgs_spec.arrays import Array32
 from policy_node.policies.actor import MLP, Actor
 from policy_node.policies.network_shape import NetworkShape
 from policy_node.training.configuration.config import TrainConfig
@@ -210,16 +209,6 @@ class DDPG(ActorCritic):
         del batch
         cost: Tensor = self.config.action_l2 * action.float().square().mean()
         return cost
-
-    @torch.no_grad()
-    def act(self, observation: Array32, goal: Array32) -> Array32:
-        """Return actions (batch, action_size) of the actor, without noise."""
-        features = self.actor.features(self.tensor(observation), self.tensor(goal))
-        return self._actions(features)
-
-    def _actions(self, features: Tensor) -> Array32:
-        action: Array32 = self.actor(features).cpu().numpy()
-        return action
 
     def modules(self) -> dict[str, nn.Module]:
         """Return the modules to save in the training state, by name."""

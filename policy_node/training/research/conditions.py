@@ -165,10 +165,6 @@ class ConditionedDDPG(DDPG):
         actor.network = fold(network, actor.shape, _ACTING[self.config.condition])
         return actor.cpu().eval()
 
-    def _actions(self, features: Tensor) -> Array32:
-        acting = features.new_full((len(features), 1), _ACTING[self.config.condition])
-        return super()._actions(torch.cat([features, acting], dim=-1))
-
 
 def fold(network: MLP, shape: NetworkShape, value: float) -> MLP:
     """Return a copy of `network` without its last input, the condition, which is fixed at `value`.

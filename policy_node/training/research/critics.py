@@ -27,10 +27,7 @@ _DROPPED_SHARE = 2 / 25
 # Names of the tensors of an `Ensemble`.
 _MEMBER = re.compile(r'members\.(\d+)\.(.+)')
 
-Aggregate = Callable[[Tensor], Tensor]
-
-
-AGGREGATES: dict[str, Aggregate] = {
+AGGREGATES: dict[str, Callable[[Tensor], Tensor]] = {
     'mean': lambda values: values.mean(dim=0),
     'min': lambda values: values.amin(dim=0),
     # Without the highest value, as TQC drops the highest atoms.

@@ -18,8 +18,9 @@ import torch
 from numpy.typing import NDArray
 
 from msgs_spec.arrays import Array32
+from policy_node.policies.actor import Actor
 from policy_node.training.experience.experience import Experience
-from policy_node.training.experience.hindsight import draw_sources, goals_of
+from policy_node.training.experience.hindsight import SOURCES, draw_sources, goals_of
 from policy_node.training.experience.replay import Starts, Transitions
 from policy_node.training.experience.sampling import TransitionSampler
 from policy_node.training.learners.ddpg import DDPG, CriticLoss
@@ -80,9 +81,8 @@ class ChoosingSampler(TransitionSampler):
 
     def _best(self, starts: Starts, first: Array32, generator: np.random.Generator) -> Array32:
         """Return the highest-scored goals among `first` and seven new future goals for each."""
-        candidates, source = [first], np.zeros(len(first), np.intp)
-        for _ in range(CANDIDATES - 1):
-            candidates.append(goals_of(starts, source, ['future'], generator))
+        more = (SOURCES['future'](starts, generator) for _ in range(CANDIDATES - 1))
+        candidates = [first, *more]
         repeated = starts.select(np.tile(np.arange(len(first)), CANDIDATES))
         batch = self.single(repeated, np.concatenate(candidates))
         score = SCORES[self.choice](self.judge, batch)
@@ -110,11 +110,11 @@ class CuttingSampler(TransitionSampler):
     """Ends n-step returns before the first action that is far from the actor's action.
 
     Attributes:
-        judge: The learner whose actor gives the action to compare with.
+        actor: The actor that learns; its actions are compared with those in a return.
         cut_distance: Largest root mean square distance of an action in a return from that action.
     """
 
-    judge: DDPG
+    actor: Actor
     cut_distance: float = 0.3
 
     def steps(
@@ -130,7 +130,7 @@ class CuttingSampler(TransitionSampler):
                 break
             place = starts.row[going], starts.tick[going] + step
             taken = episodes.action[place]
-            own = self.judge.act(episodes.observation[place], goal[going])
+            own = self.actor.act(episodes.observation[place], goal[going])
             distance = np.sqrt(np.square(taken - own).mean(axis=-1))
             steps[going[distance <= self.cut_distance]] += 1
         return steps

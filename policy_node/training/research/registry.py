@@ -111,7 +111,7 @@ def make_sampler(
     if config.correction == 'lambda':
         return judged.LambdaSampler(**fields, trace=config.trace)
     if judge is not None and config.correction == 'cut':
-        return judged.CuttingSampler(**fields, judge=judge)
+        return judged.CuttingSampler(**fields, actor=judge.actor)
     if config.subgoal_every:
         return TransitionSampler(**fields, sources=hierarchy.LOW_SOURCES)
     return TransitionSampler(**fields)

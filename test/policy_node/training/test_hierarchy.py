@@ -248,8 +248,8 @@ def test_the_actor_is_drawn_to_what_it_does_for_the_subgoal():
     def distance():
         with torch.no_grad():
             subgoal = learner.imagine(known.features)
-            prior = learner.act(batch.observation, subgoal.numpy())
-            own = learner.act(batch.observation, batch.goal)
+            prior = learner.actor.act(batch.observation, subgoal.numpy())
+            own = learner.actor.act(batch.observation, batch.goal)
             penalty = learner._penalty(known, learner.actor(known.features))
         assert float(penalty) == pytest.approx(5.0 * np.square(own - prior).mean(), rel=1e-4)
         return float(penalty)

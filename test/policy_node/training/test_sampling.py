@@ -69,7 +69,7 @@ def test_lambda_draws_the_weights_of_the_lambda_return(walk):
 
 
 def test_cut_ends_a_return_before_an_action_the_actor_would_not_take(walk):
-    batch = draw(walk, CuttingSampler(at_goal, 0.5, 5, judge=Returning()))
+    batch = draw(walk, CuttingSampler(at_goal, 0.5, 5, actor=Returning()))
     first, last = batch.observation[:, 0], batch.next_observation[:, 0]
     # At places 3 and up it would turn round; the first action of a return is always its own.
     expected = np.where(first < 3, 3, first + 1)
@@ -159,14 +159,11 @@ def test_an_actor_at_one_condition_is_an_actor_like_any_other():
     learner = make_ddpg(NetworkShape(4, 3, 2, (16, 16)), config, torch.device('cpu'), Workers())
     plain = learner.acting_policy()
     assert isinstance(plain, Actor) and plain.network.hidden[0].in_features == 7
-    observation, goal = np.random.default_rng(0).normal(size=(2, 5, 4))[0], np.ones((5, 3))
-    action, _ = plain.predict({'observation': observation, 'desired_goal': goal})
-    own = learner.act(observation.astype(np.float32), goal.astype(np.float32))
-    np.testing.assert_allclose(action, own, atol=1e-6)
-    folded = fold(learner.actor.network, plain.shape, 2.0)
     features = torch.randn(5, 7)
-    wide = torch.cat([features, torch.full((5, 1), 2.0)], dim=-1)
-    torch.testing.assert_close(folded(features), learner.actor.network(wide))
+    at_two = fold(learner.actor.network, plain.shape, 2.0)
+    for folded, value in ((plain.network, 0.0), (at_two, 2.0)):
+        wide = torch.cat([features, torch.full((5, 1), value)], dim=-1)
+        torch.testing.assert_close(folded(features), learner.actor.network(wide))
 
 
 @pytest.fixture
@@ -223,7 +220,7 @@ class Judge:
         TransitionSampler(nearness, 0.9, 5),
         TransitionSampler(nearness, 0.9, 100),
         LambdaSampler(nearness, 0.9, 5, trace=0.6),
-        CuttingSampler(nearness, 0.9, 5, cut_distance=0.8, judge=Judge()),
+        CuttingSampler(nearness, 0.9, 5, cut_distance=0.8, actor=Judge()),
         HoldingSampler(nearness, 0.9, LONGEST),
     ],
     ids=['1', '2', '5', '100', 'lambda', 'cut', 'held'],
