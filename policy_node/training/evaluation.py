@@ -229,17 +229,15 @@ def evaluate(
     Raises:
         ValueError: If `episodes` is less than 1.
     """
-    outcomes: EpisodeOutcomes | None = None
-    done = 0
-    while done < episodes:
-        seeds = list(range(first_seed + done, first_seed + done + simulation.num_envs))
-        batch = run_episodes(simulation, policy, seeds)
-        outcomes = batch if outcomes is None else outcomes.join(batch)
-        done = len(outcomes)
-        if hopeless is not None and done < episodes and hopeless(outcomes):
-            break
-    if outcomes is None:
+    if episodes < 1:
         raise ValueError(f'{episodes} episodes; allowed: 1 or more')
+
+    def batch(first: int) -> EpisodeOutcomes:
+        return run_episodes(simulation, policy, list(range(first, first + simulation.num_envs)))
+
+    outcomes = batch(first_seed)
+    while len(outcomes) < episodes and not (hopeless and hopeless(outcomes)):
+        outcomes = outcomes.join(batch(first_seed + len(outcomes)))
     return outcomes.first(episodes)
 
 

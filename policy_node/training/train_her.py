@@ -20,13 +20,13 @@ from node_runtime.command_line import (
     run_command,
     say,
 )
-from policy_node.training.configuration.config import TrainConfig
+from policy_node.training.configuration.config import FIELDS, TrainConfig
 from policy_node.training.configuration.flat import (
     add_field_options,
     given_fields,
     with_assignments,
 )
-from policy_node.training.configuration.recipes import RECIPES, recipe_config
+from policy_node.training.configuration.recipes import recipe_config
 
 if TYPE_CHECKING:
     from policy_node.training.experience.replay import Episodes
@@ -48,7 +48,7 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     )
     add = parser.add_argument
     add('--task', choices=list(TASKS), metavar='TASK', help=', '.join(TASKS))
-    add('--recipe', choices=RECIPES, help='default: best')
+    add('--recipe', choices=FIELDS['recipe'].choices, help='default: best')
     add('--her', action=argparse.BooleanOptionalAction, help='hindsight on or off; default: on')
     add('--set', action='append', default=[], metavar='NAME=VALUE', help='set a field')
     add('--output', type=Path, help='default: runs/<task>_<recipe>_seed<seed>')

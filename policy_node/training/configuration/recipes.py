@@ -11,9 +11,6 @@ from msgs_spec.tasks import DEFAULT_CONTROL_HZ, task_spec
 from policy_node.training.configuration.config import DEFAULTS, TrainConfig
 from policy_node.training.configuration.flat import from_flat
 
-# Recipes of runs that start from nothing.
-FROM_NOTHING = ('paper', 'best')
-RECIPES = (*FROM_NOTHING, 'robust', 'finetune')
 # Fields that count steps, which are ticks.
 STEP_COUNTS = ('total_steps', 'evaluate_every')
 # At another rate than 25 Hz, a user who sets one of these gets no automatic changes.
@@ -46,10 +43,10 @@ def recipe_config(task: str, recipe: str, **overrides: Any) -> TrainConfig:
     Raises:
         ValueError: If the task, the recipe or a value is not allowed.
     """
-    if recipe not in RECIPES:
-        raise ValueError(f'recipe {recipe!r}; allowed: {", ".join(RECIPES)}')
-    task_spec(task)
     recipes = {'paper': _paper, 'best': _best, 'robust': _robust, 'finetune': _finetune}
+    if recipe not in recipes:
+        raise ValueError(f'recipe {recipe!r}; allowed: {", ".join(recipes)}')
+    task_spec(task)
     values = recipes[recipe](task)
     if recipe == 'best':
         values |= _at_rate(task, values, overrides)

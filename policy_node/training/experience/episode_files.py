@@ -38,7 +38,7 @@ def load_replay(path: Path, replay: EpisodeReplay) -> None:
         tensors = load_file(path)
         episodes = Episodes(**{name: tensors[name] for name in Episodes.__slots__})
         _require_whole(episodes)
-        replay.add(episodes.last(replay.capacity))
+        replay.add(episodes.select(slice(-replay.capacity, None)))
     except (OSError, SafetensorError, KeyError, IndexError, TypeError, ValueError) as error:
         raise ValueError(f'{path} is no replay of this run: {error}') from None
 
@@ -83,8 +83,7 @@ def read_experience(
     if not (usable or skipped):
         raise ValueError(str(holds_no_episode(Path(directory))))
     if not usable:
-        first = f', first: {skipped[0]}' if skipped else ''
-        raise ValueError(f'{directory} holds no usable episode of {task.name}{first}')
+        raise ValueError(f'{directory} holds no usable episode of {task.name}, first: {skipped[0]}')
     return to_experience(usable), skipped
 
 

@@ -39,10 +39,6 @@ class Episodes:
         """Steps per episode."""
         return int(self.action.shape[1])
 
-    def last(self, count: int) -> Episodes:
-        """Return the last `count` episodes, or all if there are fewer."""
-        return self.select(slice(-count, None))
-
     def select(self, rows: NDArray[np.bool_ | np.int64] | slice) -> Episodes:
         """Return the selected episodes: copies for indices or a mask, views for a slice."""
         return Episodes(*(getattr(self, name)[rows] for name in Episodes.__slots__))
@@ -82,8 +78,6 @@ class EpisodeReplay:
         weigh: Weigh = has_moved,
         count_ticks: Callable[[Episodes], NDArray[np.int64]] | None = None,
     ) -> None:
-        if capacity < 1:
-            raise ValueError(f'replay capacity {capacity} episodes; allowed: 1 or more')
         self._ring = Episodes(
             observation=np.zeros((capacity, ticks + 1, observation_size), np.float32),
             achieved_goal=np.zeros((capacity, ticks + 1, goal_size), np.float32),

@@ -58,7 +58,6 @@ from policy_node.training.runs.training_state import (
 Candidate = tuple[Actor, dict[str, Policy]]
 """An actor to evaluate, and policies beside it by column of `progress.csv`."""
 
-_LOSSES = ('critic', 'actor')
 # Largest number of steps that a resumed run without its replay collects before it learns.
 MOST_REFILLED = 100_000
 
@@ -238,13 +237,12 @@ class Trainer(BaseTrainer):
         soonest = counters.env_steps + self.config.evaluate_every
         counters.next_evaluation = min(counters.next_evaluation, soonest)
         self.experience.narrow(self._progress())
-        origin = state.extra.get('init_from', {})
-        self._folder.init_from = origin
+        self._folder.init_from = state.extra.get('init_from', {})
         self._let_critic_learn_first()
-        self._folder.read_best(self.counters)
+        self._folder.read_best(counters)
         # The state contains no simulations. Use new seeds, so that no episode is repeated.
-        self.experience.generator = self._seed(self.counters.env_steps)
-        limits = (self.counters.env_steps, self.config.replay_transitions, MOST_REFILLED)
+        self.experience.generator = self._seed(counters.env_steps)
+        limits = (counters.env_steps, self.config.replay_transitions, MOST_REFILLED)
         held = self.experience.replay.capacity * self.spec.episode_ticks
         self._steps_to_refill = min(self.workers.share(min(limits)), held)
         file = self._folder.replay_file()
@@ -442,7 +440,8 @@ class Trainer(BaseTrainer):
         self.learner.average()
         self.counters.updates = self.learner.updates
         # Check before acting or saving.
-        named = [(f'{n} loss', torch.tensor([getattr(x, n) for x in losses])) for n in _LOSSES]
+        named = [('critic loss', torch.tensor([each.critic for each in losses]))]
+        named += [('actor loss', torch.tensor([each.actor for each in losses]))]
         # The loss before the last step may be finite and the weights after it not.
         for part, module in self.learner.modules().items():
             named += [(f'{part}.{n}', value.cpu()) for n, value in module.state_dict().items()]

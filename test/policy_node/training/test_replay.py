@@ -56,8 +56,6 @@ def test_the_newest_episodes_are_kept_in_order(tmp_path):
 
 
 def test_what_cannot_fit_is_refused():
-    with pytest.raises(ValueError, match='capacity 0'):
-        EpisodeReplay(0, 3, 5, 2, 4)
     with pytest.raises(ValueError, match='3 episodes exceed the capacity of 2'):
         EpisodeReplay(2, 3, 5, 2, 4).add(numbered(0, 3))
 
