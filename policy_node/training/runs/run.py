@@ -273,7 +273,7 @@ def _prepare_folder(trainer: AnyTrainer, output: Path, command: str, resume: boo
         first = trainer.learner.critic_first if isinstance(trainer, Trainer) else 0
         if note := idle_note(trainer.config, first):
             complain(NAME, note)
-    precision, device = trainer.config.precision, trainer.workers.device
+    precision, device = trainer.config.precision, choose_device(trainer.config.device)
     if uses_bfloat16(precision, device) and not uses_bfloat16('auto', device):
         # Measured on a CPU with AVX2: 50 times longer for 1024 x 256 times 256 x 256.
         note = 'this processor emulates it and learns many times slower; use precision=float32'

@@ -10,6 +10,7 @@ import shutil
 
 import numpy as np
 import pytest
+import torch
 from safetensors.numpy import load_file, save_file
 
 from policy_node.policies.files import read_tensors, write_tensors
@@ -190,12 +191,17 @@ WHOLE = 16 * (51 * 13 + 3 + 50 * 4) * 4
 
 
 @pytest.mark.parametrize(
-    ('available', 'is_supported'), [(WHOLE, False), (WHOLE - 1, True), (None, True)]
+    ('available', 'device', 'is_supported'),
+    [(WHOLE, 'cpu', False), (WHOLE - 1, 'cpu', True), (None, 'cuda', True)],
 )
 def test_too_little_memory_and_emulated_bfloat16_are_reported_at_the_start(
-    tmp_path, monkeypatch, capsys, available, is_supported
+    tmp_path, monkeypatch, capsys, available, device, is_supported
 ):
-    monkeypatch.setattr('torch.cpu._is_avx512_bf16_supported', lambda: is_supported)
+    """Learning on a GPU needs no bfloat16 of the processor."""
+    supporting = is_supported and device == 'cpu'
+    monkeypatch.setattr('torch.cpu._is_avx512_bf16_supported', lambda: supporting)
+    monkeypatch.setattr('torch.cuda.is_bf16_supported', lambda: True)
+    monkeypatch.setattr(run_module, 'choose_device', lambda _: torch.device(device))
     monkeypatch.setattr(run_module, 'available_memory', lambda: available)
     changes = {'num_envs': 2, 'total_steps': 800, 'device': 'cpu', 'precision': 'bfloat16'}
     fields = options_of(**SMALL | changes)
