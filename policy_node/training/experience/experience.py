@@ -148,12 +148,8 @@ class Experience:
     ) -> Transitions:
         """Draw a batch with goals from `mixture`, by `sampler` or by the sampler of this object."""
         chosen, replay = sampler or self._sampler, self.replay
-        row = self._draw_rows()
+        row = replay.draw(self.batch_size, self.config.moved_share, self.generator)
         return chosen.sample(replay.episodes, row, mixture, self.generator, replay.valid_ticks)
-
-    def _draw_rows(self) -> NDArray[np.int64]:
-        """Draw an episode for each transition; return its row in the replay, (batch,)."""
-        return self.replay.draw(self.batch_size, self.config.moved_share, self.generator)
 
     def mixture(self) -> dict[str, float]:
         """Return the probability of each goal source; they add up to 1."""
