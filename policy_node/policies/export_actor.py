@@ -56,7 +56,7 @@ def _run(options: argparse.Namespace) -> int:
     except ValueError as error:
         raise UsageError(str(error)) from None
     except OSError as error:
-        raise CommandError(str(error)) from None
+        raise CommandError(f'{options.target}: {error.strerror or error}') from None
     say(f'{options.target}: actions within {difference:.1e} of the checkpoint')
     return EXIT_SUCCESS
 

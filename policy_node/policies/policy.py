@@ -88,6 +88,7 @@ class LoadedPolicy:
             PolicyError: If the policy fails, or returns anything but finite numbers of the right
                 shape; if `is_bounded`, also outside [-1, 1].
         """
+        shape: tuple[int, ...] = ()
         try:
             shape = _action_shape(observation, TASKS[self.task].robot.action_size)
             if state is None and episode_start is None:
@@ -101,11 +102,13 @@ class LoadedPolicy:
         except Exception as error:
             # Libraries raise their own types, for single observations or for all.
             problem = f'{type(error).__name__}: {one_line(error)}'
-            raise PolicyError(f'{self.description} fails: {problem}') from None
+            batch = f' for a batch of {shape[0]} observations' if len(shape) > 1 else ''
+            raise PolicyError(f'{self.description} fails{batch}: {problem}') from None
         if action.shape != shape or not is_finite:
             raise PolicyError(
                 f'{self.description} returned {one_line(action, 100)} of shape {action.shape}; '
                 f'allowed: finite numbers, shape {shape}'
+                f'{", one row per observation" if len(shape) > 1 else ""}'
             )
         if self.is_bounded and (np.abs(action) > 1.0).any():
             raise PolicyError(
