@@ -29,6 +29,7 @@ from msgs_spec.topics import DIAGNOSTICS, topic, topics
 from node_runtime.command_line import (
     EXIT_FAILURE,
     EXIT_SUCCESS,
+    EXIT_USAGE,
     CommandError,
     CommandParser,
     complain,
@@ -135,9 +136,10 @@ class Demo:
             watcher.close(exit_code)
 
     def _play(self, policy: str, watcher: Watcher, stop: StopSignals) -> int:
-        """Run both nodes until the episodes are logged; return 0, or 1 after a failure.
+        """Run both nodes until the episodes are logged; return 0, or after a failure 1 or 2.
 
-        After a failure, print the output of the nodes. `policy` is a value of `--policy`.
+        After a failure, print the output of the nodes; 2 means that a node rejects its parameters.
+        `policy` is a value of `--policy`.
         """
         began = time.monotonic()
         with open_log('demo') as output:
@@ -155,7 +157,7 @@ class Demo:
             if any(codes) or (len(self._outcomes) < self._options.episodes and not stop):
                 print(Path(output.name).read_text())
                 say(f'sim_node and policy_node ended with exit codes {codes}')
-                return EXIT_FAILURE
+                return EXIT_USAGE if EXIT_USAGE in codes else EXIT_FAILURE
         self._print_summary(time.monotonic() - began)
         return EXIT_SUCCESS
 

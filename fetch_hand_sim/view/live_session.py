@@ -177,12 +177,13 @@ def _start(options: argparse.Namespace, node: Node, log: IO[str]) -> Nodes:
 
 
 def check_alive(nodes: Nodes, log: IO[str]) -> None:
-    """Raise NodeFailure if a started node has ended; the message shows the last lines of `log`."""
+    """Raise NodeFailure if a started node has ended; its message ends with problems from `log`."""
     for name, process in nodes.items():
         code = process.poll()
         if code is not None:
-            lines = Path(log.name).read_text(errors='replace').strip().splitlines()[-_LAST_LINES:]
-            output = f': {" / ".join(lines)}' if lines else ''
+            lines = Path(log.name).read_text(errors='replace').strip().splitlines()
+            problems = [line for line in lines if '[INFO]' not in line][-_LAST_LINES:]
+            output = f': {" / ".join(problems)}' if problems else ''
             cause = f'ended with exit code {code}'
             if code < 0:
                 cause = f'was killed by {signal.Signals(-code).name}'

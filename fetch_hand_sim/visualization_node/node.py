@@ -208,7 +208,8 @@ class VisualizationNode(Node):
             **{f'picture time {k} (ms)': v for k, v in camera.picture_time.milliseconds().items()},
         }
         report = Report(self.get_fully_qualified_name(), task, values, f'shows {task}')
-        if problem := camera.problem():
+        is_drawn = any(self._has_listener(name) for name in _PICTURES)
+        if is_drawn and (problem := camera.problem()):
             report.warn(problem)
             self.get_logger().warning(problem, **seldom(60.0))
         self._diagnostics.publish(encode_reports(report))

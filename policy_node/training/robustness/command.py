@@ -83,6 +83,7 @@ def _run(options: argparse.Namespace) -> int:
     loaded = load_chosen_policy(options)
     simulation = make_chosen_simulation(options, loaded)
     name = options.output or Path(f'{loaded.task}.robustness')
+    name = name.with_suffix('') if name.suffix == '.json' else name
     if not name.name:
         raise UsageError(f'--output {name}; allowed: the path of a file')
     files = {kind: name.with_name(f'{name.name}.{kind}') for kind in ('json', 'csv', 'png')}

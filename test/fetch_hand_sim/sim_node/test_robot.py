@@ -120,13 +120,17 @@ def test_commands_that_stop_are_missed_in_any_mode(make, factor):
     assert case.robot.misses_commands, 'the next episode misses them too'
     case.command()
     assert not case.robot.misses_commands
-    case.clock.now += 5.0
+    case.clock.now += 0.9
     case.robot.pause(True)
+    case.clock.now += 5.0
     assert not case.robot.misses_commands
     case.robot.pause(False)
     assert not case.robot.misses_commands
     case.clock.now += 1.1
     assert case.robot.misses_commands
+    for paused in (True, False):
+        case.robot.pause(paused)
+    assert case.robot.misses_commands, 'they had stopped before the pause'
     case = make('lockstep')
     assert not case.robot.misses_commands
     case.robot.tick_when_due()

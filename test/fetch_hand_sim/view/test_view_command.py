@@ -99,7 +99,10 @@ def test_a_namespace_is_taken_with_and_without_slashes(name):
     ('code', 'said'),
     [
         ('import os; os.kill(os.getpid(), 9)', 'sim_node was killed by SIGKILL'),
-        ('exit("no such task")', 'sim_node ended with exit code 1: no such task'),
+        (
+            'import sys; print("[INFO] [sim_node]: episode 0", file=sys.stderr); exit("no task")',
+            'sim_node ended with exit code 1: no task',
+        ),
     ],
 )
 def test_a_node_that_dies_is_named_with_its_cause(code, said, tmp_path):
