@@ -278,6 +278,14 @@ NODES = {
 }
 
 
+def episode_seed(first: int, episode: int) -> int:
+    """Return the seed of the episode with this index, from 0; `first` is the seed of episode 0.
+
+    Seed 0 follows `LARGEST_SEED`.
+    """
+    return (first + episode) % (LARGEST_SEED + 1)
+
+
 def validate(spec: ParameterSpec, value: object) -> None:
     """Raise ValueError if a value is not allowed; the message names the allowed values."""
     if not _is_allowed(spec, value):

@@ -22,7 +22,7 @@ from fetch_hand_sim.commands.node_processes import (
 )
 from fetch_hand_sim.episode_log import EpisodeOutcome, EpisodeRecord, read_summary
 from msgs_spec.codecs import decode_status
-from msgs_spec.parameters import LARGEST_SEED
+from msgs_spec.parameters import LARGEST_SEED, episode_seed
 from msgs_spec.tasks import TaskSpec, task_spec
 from msgs_spec.tick import EpisodeStatus
 from msgs_spec.topics import DIAGNOSTICS, topic, topics
@@ -195,7 +195,7 @@ class Demo:
             except ValueError:
                 continue
             # Another simulator node may log into the same folder.
-            seed = (self._options.seed + record.episode) % (LARGEST_SEED + 1)
+            seed = episode_seed(self._options.seed, record.episode)
             if (record.task.name, record.seed) != (self._spec.name, seed):
                 continue
             outcome = summary.outcome

@@ -18,14 +18,13 @@ from msgs_spec.arrays import Array
 from msgs_spec.codecs import check_frame, decode, message_stamp
 from msgs_spec.disturbances import Disturbances
 from msgs_spec.observations import Readings, achieved_goal
+from msgs_spec.parameters import episode_seed
 from msgs_spec.robots import JOINT_PREFIX
 from msgs_spec.tick import EpisodeStatus, Phase, Tick
 from msgs_spec.topics import TopicSpec
 
 # Simulated time of the first tick. Not 0, because ROS takes a time of 0 for "no time yet".
 FIRST_STAMP_NS = 1_000_000_000
-# Number of seeds; the first follows the last.
-_SEEDS = 2**32
 
 
 @dataclass(frozen=True, slots=True)
@@ -203,7 +202,7 @@ class EpisodeRunner:
         first = self._first_seed
         if self.is_between_episodes and self._new_first_seed is not None:
             first = self._new_first_seed
-        return (first + self.episode) % _SEEDS
+        return episode_seed(first, self.episode)
 
     @property
     def has_started(self) -> bool:

@@ -83,7 +83,7 @@ class Robot:
         self._encoder = TickEncoder(runner.spec)
         self.last_messages: Messages = []
         self._ticked_at = self._resumed_at = -math.inf
-        # Whether commands had stopped before the pause.
+        # True if the commands had stopped before the last pause began.
         self._had_stopped = False
         self._reset_due: float | None = None
         self._late_commands = 0
@@ -237,12 +237,11 @@ class Robot:
         """Pause or resume ticks and simulated time; `success` is always True."""
         if paused == self.schedule.is_paused:
             return Answer(True, 'already paused' if paused else 'already running')
-        had_stopped = self.misses_commands
-        self.schedule.set_paused(paused, self._clock())
         if paused:
-            self._had_stopped = had_stopped
+            self._had_stopped = self.misses_commands
         elif not self._had_stopped:
             self._resumed_at = self._clock()
+        self.schedule.set_paused(paused, self._clock())
         return Answer(True, f'{"paused" if paused else "running"} at {self._now()}')
 
     def step(self, ticks: int = 1) -> Answer:

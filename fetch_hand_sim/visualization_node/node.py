@@ -115,6 +115,9 @@ class VisualizationNode(Node):
     def _has_listener(self, name: str) -> bool:
         return bool(self._outputs[name].get_subscription_count())
 
+    def _wanted_pictures(self) -> list[str]:
+        return [name for name in _PICTURES if self._has_listener(name)]
+
     def _on_status(self, status: EpisodeStatus) -> None:
         spec = spec_of(status)
         # The URDF contains the names of the joints.
@@ -180,9 +183,8 @@ class VisualizationNode(Node):
         tick = self._undrawn
         if tick is None or not self._camera.is_due:
             return
-        wanted = [name for name in _PICTURES if self._has_listener(name)]
         self._undrawn = None
-        if wanted:
+        if wanted := self._wanted_pictures():
             self._take_photo(scene, tick, wanted)
 
     def _repeat_for_newcomers(self) -> None:
@@ -208,8 +210,7 @@ class VisualizationNode(Node):
             **{f'picture time {k} (ms)': v for k, v in camera.picture_time.milliseconds().items()},
         }
         report = Report(self.get_fully_qualified_name(), task, values, f'shows {task}')
-        is_drawn = any(self._has_listener(name) for name in _PICTURES)
-        if is_drawn and (problem := camera.problem()):
+        if self._wanted_pictures() and (problem := camera.problem()):
             report.warn(problem)
             self.get_logger().warning(problem, **seldom(60.0))
         self._diagnostics.publish(encode_reports(report))

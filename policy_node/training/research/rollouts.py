@@ -285,7 +285,7 @@ class OnPolicyExperience(Experience):
 
     def batch(self) -> Transitions:
         """Draw transitions of the newest cycle."""
-        # Only the first update of a cycle knows the actor that collected it.
+        # Made before the first update of a cycle, which changes the actor that collected it.
         rollouts = self._rollouts = self._rollouts or self._roll_out()
         row, ticks = self._draw_rows(), self.replay.ticks
         drawn = row * ticks + self.generator.integers(ticks, size=len(row))
