@@ -1,12 +1,9 @@
-"""Follow a robot or a replay over its topics; assemble each tick from its messages.
-
-Subscriptions are best effort: a slow viewer loses messages, and the robot does not resend them.
-"""
+"""Follow a robot or a replay over its topics."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -16,6 +13,7 @@ from rclpy.clock_type import ClockType
 from rclpy.node import Node, NodeNameNonExistentError
 
 from fetch_hand_sim.simulation.scene import Frame
+from fetch_hand_sim.view.tick_assembly import NEEDED, TickAssembly, Values
 from msgs_spec.arrays import Array
 from msgs_spec.codecs import TopicCodec, decode_status
 from msgs_spec.schemas import deserialize
@@ -26,20 +24,17 @@ from node_runtime.ros import count_publishers, full_name, subscribe
 
 # QoS of a viewer.
 WATCHING = QosSpec(depth=5, reliability='best_effort', durability='volatile')
-# QoS for every tick: two seconds at 25 Hz.
-_FOLLOWING = replace(WATCHING, depth=50)
+# QoS for every tick: two seconds at 25 Hz. A busy machine loses best-effort messages.
+_FOLLOWING = replace(WATCHING, depth=50, reliability='reliable')
 ANY_TASK = next(iter(TASKS.values()))
-# Topics of a tick in the order of publication. A reset has no reward and no command.
-_FIRST, _LAST = 'joint_states', 'applied_command'
-_NEEDED = (_FIRST, 'desired_goal', 'achieved_goal')
-_STATE = (*_NEEDED, 'is_success', 'reward', _LAST)
+# Topics of a tick. A reset has no reward and no command.
+_STATE = (*NEEDED, 'is_success', 'reward', 'applied_command')
 # Seconds between the end of a robot's subscriptions and those to another robot. The executor
 # removes the old ones after the callback; until then a topic cannot have another type.
 _CHANGE_TIME = 0.2
-# Stamp of messages without one.
-_NO_STAMP = 0
-# Seconds between two looks for a publisher of `latest_tick`.
-_CHOICE_PERIOD = 0.5
+# Seconds between two looks for a publisher of `latest_tick`. An incomplete tick is shown if no
+# message comes between two looks.
+_LOOK_PERIOD = 0.5
 # Seconds over which the ticks of a replay are counted.
 _COUNT_PERIOD = 1.0
 # Looks after which a tick was certainly published after the pause.
@@ -90,8 +85,8 @@ class RobotWatch:
         self._on_status = on_status
         self._on_tick = on_tick
         self.status: EpisodeStatus | None = None
-        self._values: dict[str, Array] = {}
-        self._stamp_ns = 0
+        self._assembly = TickAssembly(())
+        self._is_quiet = False
         self._every_tick = every_tick
         self._takes_latest = False
         self._codecs: dict[str, TopicCodec] = {}
@@ -101,8 +96,7 @@ class RobotWatch:
         subscribe(node, status, self._on_status_message)
         # Steady time, because simulated time stops with the robot.
         self._clock = Clock(clock_type=ClockType.STEADY_TIME)
-        if not every_tick:
-            node.create_timer(_CHOICE_PERIOD, self._choose, clock=self._clock)
+        node.create_timer(_LOOK_PERIOD, self._look, clock=self._clock)
 
     @property
     def spec(self) -> TaskSpec | None:
@@ -128,7 +122,7 @@ class RobotWatch:
         self.status = status
         self._on_status(status)
         if status.phase == 'reset':
-            self._finish_tick()
+            self._emit(self._assembly.flush())
 
     def _take_latest(self, data: bytes) -> None:
         try:
@@ -138,17 +132,19 @@ class RobotWatch:
             given = {
                 name: self._codecs[name].decode(parts[name]) for name in parts.keys() & self._codecs
             }
-            stamp_ns = given[_FIRST][0]
+            stamp_ns = given['joint_states'][0]
         except (KeyError, ValueError):
             return
         self._take_status(status)
         # Without subscriptions, this was the first status of another robot.
-        if self._subscriptions:
-            self._values = {name: values for name, (_, values) in given.items()}
-            self._stamp_ns = stamp_ns
-            self._finish_tick(status)
+        if self._subscriptions and given.keys() >= NEEDED:
+            values = {name: values for name, (_, values) in given.items()}
+            self._emit([(stamp_ns, values)], status)
 
-    def _choose(self) -> None:
+    def _look(self) -> None:
+        if self._is_quiet:
+            self._emit(self._assembly.flush())
+        self._is_quiet = True
         if self.spec is not None and self._has_latest() != self._takes_latest:
             self._follow(self.spec)
 
@@ -156,7 +152,7 @@ class RobotWatch:
         return not self._every_tick and count_publishers(self._node, LATEST_TICK.name) > 0
 
     def _follow(self, spec: TaskSpec) -> None:
-        self._values = {}
+        self._assembly = TickAssembly(())
         if not self._subscriptions and self._change is None:
             self._subscribe_to(spec)
             return
@@ -176,6 +172,7 @@ class RobotWatch:
         self._end_change()
         names = [*_STATE, *(['object_pose'] if spec.has_object else [])]
         self._codecs = {name: TopicCodec(topic(spec, name)) for name in names}
+        self._assembly = TickAssembly(names)
         self._takes_latest = self._has_latest()
         collectors = {each.topic: self._collector(each) for each in self._codecs.values()}
         callbacks = {LATEST_TICK: self._take_latest} if self._takes_latest else collectors
@@ -186,47 +183,38 @@ class RobotWatch:
         ]
 
     def _collector(self, codec: TopicCodec) -> Callable[[bytes], None]:
-        source = codec.topic
-
         def collect(data: bytes) -> None:
             try:
-                stamp, values = codec.decode(data)
+                stamp_ns, values = codec.decode(data)
             except ValueError:
                 return
-            if source.name == _FIRST:
-                # Finish the tick before, in case its last message was lost.
-                self._finish_tick()
-                self._values, self._stamp_ns = {}, stamp
-            elif stamp not in (_NO_STAMP, self._stamp_ns):
-                # The first message of this tick was lost: drop the tick.
-                self._finish_tick()
-                self._values = {}
-            self._values[source.name] = values
-            if source.name == _LAST:
-                self._finish_tick()
+            self._is_quiet = False
+            self._emit(self._assembly.add(codec.topic.name, stamp_ns, values))
 
         return collect
 
-    def _finish_tick(self, status: EpisodeStatus | None = None) -> None:
-        """Call `on_tick` if joints and goals have arrived; `status` is for this tick.
+    def _emit(
+        self, ticks: Iterable[tuple[int, Values]], status: EpisodeStatus | None = None
+    ) -> None:
+        """Call `on_tick` for stamps and values of ticks.
 
         The position of a joint that the robot does not publish is 0.
         """
-        values, spec = self._values, self.spec
-        if spec is None or any(name not in values for name in _NEEDED):
+        spec = self.spec
+        if spec is None:
             return
-        self._values = {}
-        positions = values['joint_states'][: len(spec.robot.joints)]
-        frame = Frame(
-            joint_position=np.where(np.isfinite(positions), positions, 0.0),
-            desired_goal=values['desired_goal'],
-            achieved_goal=values['achieved_goal'],
-            object_pose=values.get('object_pose'),
-            is_success='is_success' in values and bool(values['is_success'][0]),
-        )
-        reward = float(values['reward'][0]) if 'reward' in values else None
-        command = values.get('applied_command')
-        self._on_tick(SeenTick(self._stamp_ns, frame, reward, command, status))
+        for stamp_ns, values in ticks:
+            positions = values['joint_states'][: len(spec.robot.joints)]
+            frame = Frame(
+                joint_position=np.where(np.isfinite(positions), positions, 0.0),
+                desired_goal=values['desired_goal'],
+                achieved_goal=values['achieved_goal'],
+                object_pose=values.get('object_pose'),
+                is_success='is_success' in values and bool(values['is_success'][0]),
+            )
+            reward = float(values['reward'][0]) if 'reward' in values else None
+            command = values.get('applied_command')
+            self._on_tick(SeenTick(stamp_ns, frame, reward, command, status))
 
 
 def _read_status(message: Any) -> EpisodeStatus:

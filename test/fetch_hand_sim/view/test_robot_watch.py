@@ -125,6 +125,16 @@ def test_a_tick_that_lost_its_first_message_does_not_pass_for_the_one_before(nod
         assert 'joint_states' not in lost and 'achieved_goal' not in lost
 
 
+def test_the_last_tick_before_a_pause_is_shown_also_without_one_of_its_messages(node):
+    seen, robot = [], Robot(node)
+    watch = RobotWatch(node, lambda status: None, seen.append)
+    act_until(node, robot.tick, lambda: len(seen) > 3)
+    assert watch.status.phase == 'reset'
+    last = robot.tick(lost=('applied_command',))
+    act_until(node, lambda: None, lambda: seen[-1].stamp_ns == last.stamp_ns)
+    assert seen[-1].command is None and seen[-1].reward == last.reward
+
+
 class Page:
     """A viewer of a robot with its latest picture."""
 
