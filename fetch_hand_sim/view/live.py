@@ -16,16 +16,9 @@ from fetch_hand_sim.view.curves import History
 from fetch_hand_sim.view.picture import ONLY_WATCHED, Facts, Picture
 from fetch_hand_sim.view.requests import Request, SetCommand, SetCommanding, SetGoal
 from fetch_hand_sim.view.robot_requests import RobotRequests
-from fetch_hand_sim.view.robot_watch import (
-    ANY_TASK,
-    WATCHING,
-    ReplayWatch,
-    RobotWatch,
-    SeenTick,
-    spec_of,
-    status_publishers,
-)
 from fetch_hand_sim.view.web import FOLLOWING, OVERLOOKING
+from fetch_hand_sim.watch.replay_watch import ReplayWatch, status_publishers
+from fetch_hand_sim.watch.robot_watch import ANY_TASK, WATCHING, RobotWatch, SeenTick, spec_of
 from msgs_spec.codecs import decode_status
 from msgs_spec.tasks import TaskSpec
 from msgs_spec.tick import EpisodeStatus

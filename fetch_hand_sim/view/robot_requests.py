@@ -25,7 +25,7 @@ from fetch_hand_sim.view.requests import (
     SetSpeed,
     StepOnce,
 )
-from fetch_hand_sim.view.robot_watch import Replay
+from fetch_hand_sim.watch.replay_watch import Replay
 from msgs_spec.arrays import Array
 from msgs_spec.codecs import TopicCodec, build_message
 from msgs_spec.schemas import serialize

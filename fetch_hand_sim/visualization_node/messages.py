@@ -19,8 +19,8 @@ from fetch_hand_sim.simulation.rewards import GoalMetric
 from fetch_hand_sim.simulation.scene import Frame, Scene
 from fetch_hand_sim.simulation.scene import Marker as Shape
 from fetch_hand_sim.simulation.urdf import ROOT
-from fetch_hand_sim.view.robot_watch import SeenTick
 from fetch_hand_sim.visualization_node.transforms import Transform
+from fetch_hand_sim.watch.robot_watch import SeenTick
 from msgs_spec.arrays import Array, Picture
 from msgs_spec.codecs import TopicCodec
 from msgs_spec.topics import scalar_topics

@@ -10,7 +10,6 @@ from rclpy.node import Node
 
 from fetch_hand_sim.simulation.rewards import GoalMetric
 from fetch_hand_sim.simulation.scene import Scene
-from fetch_hand_sim.view.robot_watch import RobotWatch, SeenTick, spec_of
 from fetch_hand_sim.visualization_node import NODE_NAME
 from fetch_hand_sim.visualization_node.messages import (
     Camera,
@@ -27,6 +26,7 @@ from fetch_hand_sim.visualization_node.transforms import (
     frame_prefix,
     view_transform,
 )
+from fetch_hand_sim.watch.robot_watch import RobotWatch, SeenTick, spec_of
 from msgs_spec.arrays import Picture
 from msgs_spec.parameters import VISUALIZATION_NODE
 from msgs_spec.tasks import TaskSpec

@@ -18,9 +18,10 @@ NODES = (
     'fetch_hand_sim.view.live',
     'fetch_hand_sim.view.live_session',
     'fetch_hand_sim.view.robot_requests',
-    'fetch_hand_sim.view.robot_watch',
     'fetch_hand_sim.visualization_node.messages',
     'fetch_hand_sim.visualization_node.node',
+    'fetch_hand_sim.watch.replay_watch',
+    'fetch_hand_sim.watch.robot_watch',
     'policy_node.node',
 )
 # Imports only what the user has installed.

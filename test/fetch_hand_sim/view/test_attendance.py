@@ -18,7 +18,7 @@ from fetch_hand_sim.view.guard import Attendance, Guard, guarded_serve
 from fetch_hand_sim.view.live import LiveRobot
 from fetch_hand_sim.view.requests import ReleaseGoal, SetCommand, SetCommanding, SetGoal
 from fetch_hand_sim.view.robot_requests import RemoteNode
-from fetch_hand_sim.view.robot_watch import SeenTick
+from fetch_hand_sim.watch.robot_watch import SeenTick
 from msgs_spec.tasks import task_spec
 from support.random_ticks import episode_status
 

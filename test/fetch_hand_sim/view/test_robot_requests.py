@@ -18,7 +18,7 @@ from fetch_hand_sim.view.requests import (
     SetSpeed,
 )
 from fetch_hand_sim.view.robot_requests import RobotRequests
-from fetch_hand_sim.view.robot_watch import Replay
+from fetch_hand_sim.watch.replay_watch import Replay
 from msgs_spec.codecs import decode
 from msgs_spec.tasks import task_spec
 from msgs_spec.topics import topic

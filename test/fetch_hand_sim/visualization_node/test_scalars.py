@@ -9,8 +9,8 @@ from rclpy.serialization import deserialize_message
 
 from fetch_hand_sim.simulation.rewards import GoalMetric
 from fetch_hand_sim.simulation.scene import Frame
-from fetch_hand_sim.view.robot_watch import SeenTick
 from fetch_hand_sim.visualization_node.messages import Scalars
+from fetch_hand_sim.watch.robot_watch import SeenTick
 from msgs_spec.codecs import decode, message_stamp
 from msgs_spec.tasks import task_spec
 from msgs_spec.topics import scalar_topics

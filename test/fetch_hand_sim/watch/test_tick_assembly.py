@@ -6,7 +6,7 @@ import itertools
 
 import numpy as np
 
-from fetch_hand_sim.view.tick_assembly import TickAssembly
+from fetch_hand_sim.watch.tick_assembly import TickAssembly
 
 STAMPED = ('joint_states', 'desired_goal', 'achieved_goal')
 NAMES = (*STAMPED, 'is_success', 'reward', 'applied_command')

@@ -1,0 +1,1 @@
+"""Follow a robot or a replay over its topics."""
