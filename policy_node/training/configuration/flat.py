@@ -120,16 +120,24 @@ def typed_fields(values: Mapping[str, Any]) -> dict[str, Any]:
     Raises:
         ValueError: If a field is unknown or a value is not of its type.
     """
-    unknown = sorted(values.keys() - FIELDS.keys())
-    if unknown:
-        near = did_you_mean(unknown[0], list(FIELDS))
-        raise ValueError(f'unknown configuration fields: {", ".join(unknown)}{near}')
     found = {}
     for name, value in values.items():
+        _require_field(name)
         is_text = isinstance(value, str) and name in ('goals', 'reward_grades')
         kind = FIELDS[name].kind
         found[name] = parse_value(name, value) if is_text else _typed(name, value, kind)
     return found
+
+
+def _require_field(name: str) -> None:
+    """Raise ValueError if `TrainConfig` has no field `name`; suggest the field of an option."""
+    if name in FIELDS:
+        return
+    meanings = dict(zip(FIELDS, FIELDS, strict=True)) | {'her': 'strategy'}
+    for field, options in _OTHER_NAMES.items():
+        meanings |= {option.removeprefix('--'): field for option in options}
+    near = did_you_mean(name, meanings) or f'; allowed: {", ".join(FIELDS)}'
+    raise ValueError(f'{name[:80]!r} is no field of TrainConfig{near}')
 
 
 def _typed(name: str, value: Any, kind: Any) -> Any:
@@ -158,9 +166,7 @@ def parse_assignment(text: str) -> tuple[str, Any]:
         ValueError: If the field is unknown or the value does not fit its type.
     """
     name, separator, value = text.partition('=')
-    if name not in FIELDS:
-        near = did_you_mean(name, list(FIELDS)) or f'; allowed: {", ".join(FIELDS)}'
-        raise ValueError(f'{name[:80]!r} is no field of TrainConfig{near}')
+    _require_field(name)
     if not separator:
         raise ValueError(f'{text!r} is not name=value: give {name}=...')
     return name, parse_value(name, value)

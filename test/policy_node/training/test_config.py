@@ -109,6 +109,9 @@ def test_scalars_of_numpy_are_values_of_python():
     [
         ('gamma', "'gamma' is not name=value: give gamma="),
         ('zzz=1', "'zzz' is no field of TrainConfig; allowed: task, "),
+        ('steps=1', "'steps' is no field of TrainConfig; did you mean 'total_steps'?"),
+        ('threads=1', "'threads' is no field of TrainConfig; did you mean 'simulation_threads'?"),
+        ('her=false', "'her' is no field of TrainConfig; did you mean 'strategy'?"),
         ('layer_norm=maybe', "layer_norm 'maybe' is not of type bool"),
         ('num_envs=1.5', "num_envs '1.5' is not of type int"),
         ('hidden_sizes=wide', "hidden_sizes 'wide' is not numbers with commas"),
@@ -200,7 +203,7 @@ def test_a_run_that_ends_before_it_learns_is_noted(changes, note):
 
 def test_an_unknown_stored_field_is_refused():
     stored = to_flat(recipe_config('FetchPush', 'best'))
-    with pytest.raises(ValueError, match='unknown configuration fields: colour'):
+    with pytest.raises(ValueError, match="'colour' is no field of TrainConfig"):
         config_from_dict({**stored, 'colour': 1})
 
 
