@@ -40,7 +40,7 @@ class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32
         'render_fps': int(DEFAULT_CONTROL_HZ),
     }
 
-    _batch = {'num_threads': 1, 'keeps_data': True}  # noqa: RUF012
+    _batch = {'num_envs': 1, 'num_threads': 1, 'keeps_data': True}  # noqa: RUF012
 
     @cached_property
     def _physics(self) -> SharedPhysics:

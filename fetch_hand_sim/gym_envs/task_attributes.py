@@ -81,6 +81,8 @@ class TaskAttributes:
                 raise TypeError(f'{name} would have no effect here; {self._hint}')
         if render_mode is not None:
             one_of(render_mode, self.metadata['render_modes'], 'render_mode')
+        if 'num_envs' in self._batch.keys() & batch.keys():
+            raise TypeError('num_envs is for fetch_hand_sim.make_vec; make returns one environment')
         self.simulation = Simulation(
             task,
             reward_type=reward_type,

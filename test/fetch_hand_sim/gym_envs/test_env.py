@@ -152,6 +152,11 @@ def test_bad_arguments_are_refused(arguments, message):
         FetchHandEnv('FetchReach', **arguments)
 
 
+def test_a_single_environment_rejects_a_number_of_environments():
+    with pytest.raises(TypeError, match=r'num_envs is for fetch_hand_sim\.make_vec'):
+        fetch_hand_sim.make('FetchReach', num_envs=4)
+
+
 @pytest.fixture
 def draw(monkeypatch):
     """Makes a started environment with small pictures, where EGL works."""
