@@ -205,7 +205,7 @@ def register_gymnasium_robotics(override: bool = False) -> None:
             False. No id is registered then.
     """
     if override:
-        from fetch_hand_sim.gym_envs.gymnasium_robotics_env import import_goal_env
+        from fetch_hand_sim.gym_envs.gymnasium_robotics_parts import import_goal_env
 
         import_goal_env()
     ids = reference_ids()
