@@ -34,12 +34,25 @@ _GIF_COLORS = 128
 _PALETTE_SAMPLES = 8
 
 
+class _Pages(TiffImagePlugin.AppendingTiffWriter):
+    """Appends pages to a TIFF; starts at the last page, where Pillow walks over all pages again."""
+
+    _last_link: int | None = None
+
+    def skipIFDs(self) -> None:
+        """Go to the link at the end of the last page, which the next page fills in."""
+        if self._last_link is not None:
+            self.f.seek(self._last_link)
+        super().skipIFDs()
+        self._last_link = self.whereToWriteNewIFDOffset
+
+
 class Roll:
     """A list of pictures (height, width, 3) of one size, uint8, losslessly compressed in memory."""
 
     def __init__(self) -> None:
         self._file = BytesIO()
-        self._writer = TiffImagePlugin.AppendingTiffWriter(self._file, new=True)
+        self._writer = _Pages(self._file, new=True)
         self._count = 0
 
     def __len__(self) -> int:

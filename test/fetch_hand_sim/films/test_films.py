@@ -19,7 +19,7 @@ from PIL import Image
 import fetch_hand_sim
 from fetch_hand_sim.commands.episodes_film import main as episodes_film
 from fetch_hand_sim.episode_log import EpisodeDirectory, EpisodeReadError, load_episodes
-from fetch_hand_sim.films.film import check_kind, check_size, write_film, write_picture
+from fetch_hand_sim.films.film import Roll, check_kind, check_size, write_film, write_picture
 from fetch_hand_sim.films.playing import Film, film_episode
 from fetch_hand_sim.films.recording import Studio, grid, load_recordings, sheets
 from fetch_hand_sim.gym_envs.env import FetchHandEnv
@@ -324,6 +324,25 @@ def test_a_film_in_memory_gives_back_every_picture_and_plays_in_a_notebook(tmp_p
         with Image.open(film.save(tmp_path / name)) as image:
             assert image.n_frames == 5
     assert film.save(tmp_path / 'film.mp4').is_file()
+
+
+def test_a_long_film_takes_a_picture_without_reading_all_earlier_ones(monkeypatch):
+    reads = []
+
+    class Watched(io.BytesIO):
+        def read(self, *size):
+            reads.append(size)
+            return super().read(*size)
+
+    monkeypatch.setattr('fetch_hand_sim.films.film.BytesIO', Watched)
+    counts = []
+    roll = Roll()
+    for picture in PICTURES * 20:
+        reads.clear()
+        roll.add(picture)
+        counts.append(len(reads))
+    assert counts[-1] == counts[2]
+    assert [each.tolist() for each in roll] == [each.tolist() for each in PICTURES * 20]
 
 
 @pytest.mark.parametrize(
