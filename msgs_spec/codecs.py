@@ -38,6 +38,14 @@ def stamp_of(seconds: int, nanoseconds: int) -> int:
     return seconds * _NANOSECONDS + nanoseconds
 
 
+def _fields_of(stamp: int) -> tuple[int, int]:
+    """Return the seconds and nanoseconds of a stamp, ns; ValueError beyond int32 seconds."""
+    seconds, nanoseconds = divmod(stamp, _NANOSECONDS)
+    if not -(2**31) <= seconds < 2**31:
+        raise ValueError(f'stamp of {seconds} s; allowed in ROS: -2^31 ... 2^31 - 1 s')
+    return seconds, nanoseconds
+
+
 def build_message(topic: TopicSpec, stamp: int, values: ArrayLike) -> Any:
     """Return the message that contains a vector, as an instance of `schemas.message_class`.
 
@@ -116,7 +124,7 @@ def checked_size(topic: TopicSpec, values: ArrayLike) -> Array:
 
 
 def _stamped(topic: TopicSpec, stamp: int, fields: dict[str, Any]) -> Any:
-    seconds, nanoseconds = divmod(stamp, _NANOSECONDS)
+    seconds, nanoseconds = _fields_of(stamp)
     time = message_class('builtin_interfaces/msg/Time')(sec=seconds, nanosec=nanoseconds)
     message = message_class(topic.type_name)
     if 'header' in message.__dataclass_fields__:
@@ -308,7 +316,7 @@ class TopicCodec:
         vector = checked_size(self.topic, values)
         data = bytearray(self._template)
         if self._has_stamp:
-            _STAMP.pack_into(data, _BODY, *divmod(stamp, 10**9))
+            _STAMP.pack_into(data, _BODY, *_fields_of(stamp))
         if self._is_bool:
             data[_BODY] = bool(vector[0])
         else:

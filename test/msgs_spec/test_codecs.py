@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from functools import partial
 from importlib import import_module
 
 import numpy as np
@@ -199,6 +200,14 @@ def test_invalid_bytes_are_rejected_in_one_line(name):
         with pytest.raises(ValueError) as error:
             codec.decode(data)
         assert '\n' not in str(error.value)
+
+
+@pytest.mark.parametrize('seconds', [2**31, -(2**31) - 1])
+def test_a_stamp_beyond_int32_seconds_is_invalid(seconds):
+    spec, values = topic(TASKS['FetchReach'], 'desired_goal'), np.zeros(3)
+    for encode in (TopicCodec(spec).encode, partial(build_message, spec)):
+        with pytest.raises(ValueError, match=f'stamp of {seconds} s; allowed in ROS'):
+            encode(seconds * 10**9, values)
 
 
 @pytest.mark.parametrize('task', ['FetchReach', 'HandReach'])

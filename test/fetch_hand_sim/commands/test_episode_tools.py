@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +30,7 @@ from fetch_hand_sim.episode_log.reader import split_ticks
 from fetch_hand_sim.episodes.checker import check_episode
 from fetch_hand_sim.episodes.generator import EpisodeGenerator
 from fetch_hand_sim.episodes.recorder import RecordingContext, former_model_sha256, model_sha256
+from fetch_hand_sim.episodes.runner import EpisodeRunner
 from fetch_hand_sim.simulation import Simulation
 from msgs_spec.codecs import TopicCodec
 from msgs_spec.robots import action_from_command
@@ -200,6 +202,20 @@ def test_check_runs_goals_that_were_set_on_the_way(tmp_path):
     assert check_episode(path).difference is None
     (arrays,) = load_episodes(path)
     assert len(np.unique(arrays.goals, axis=0)) == 2
+
+
+def test_check_of_an_episode_at_the_end_of_ros_time_is_one_line(tmp_path):
+    recorder = Recorder('FetchReach')
+    first = 2**31 * 10**9 - 5 * 40_000_000
+    recorder.runner = EpisodeRunner(recorder.simulation, first_stamp_ns=first)
+    writer = EpisodeDirectory(tmp_path).begin(recorder.spec.name, 0, recorder.metadata())
+    for tick, messages in islice(rested_episode(recorder.runner), 5):
+        writer.write_tick(tick.stamp_ns, messages)
+    # A sixth tick, whose stamp would not fit into a message.
+    writer.write_tick(tick.stamp_ns + 10**6, messages)
+    path = writer.finish({}, 'cut')
+    with pytest.raises(EpisodeReadError, match=r'simulated again \(stamp of 2147483648 s; allowed'):
+        check_episode(path)
 
 
 def test_the_fingerprint_of_a_log_of_1_0_is_known_too(tmp_path, monkeypatch):
