@@ -49,6 +49,8 @@ from node_runtime.ros import (
 
 _NAME = 'fetch_hand_sim demo'
 _START_TIMEOUT = 60.0
+# Seconds between two looks into the folder, which may contain thousands of episodes.
+_LOOK_PERIOD = 0.5
 # Shells add this to the number of the signal that ended a command.
 _SIGNALLED = 128
 # The name in rmw of a node that is discovered after its endpoints.
@@ -174,21 +176,26 @@ class Demo:
         self, watcher: Watcher, nodes: Sequence[subprocess.Popen[str]], stop: StopSignals
     ) -> None:
         say(_COLUMNS.format('episode', 'seed', 'steps', 'return', 'success', 'file'))
-        deadline = time.monotonic() + _START_TIMEOUT
+        now = look_at = time.monotonic()
+        deadline = now + _START_TIMEOUT
         while not stop and all(process.poll() is None for process in nodes):
             watcher.spin()
-            self._print_new_rows()
-            if not watcher.has_started and time.monotonic() > deadline:
+            now = time.monotonic()
+            if now >= look_at:
+                look_at = now + _LOOK_PERIOD
+                self._print_new_rows()
+            if not watcher.has_started and now > deadline:
                 return
 
-    def _episodes(self) -> set[Path]:
+    def _episodes(self) -> set[str]:
         if not self._directory.is_dir():
             return set()
-        return {path for path in self._directory.iterdir() if not path.name.startswith('.')}
+        return {name for name in os.listdir(self._directory) if not name.startswith('.')}
 
     def _print_new_rows(self) -> None:
-        for path in sorted(self._episodes() - self._known):
-            self._known.add(path)
+        for name in sorted(self._episodes() - self._known):
+            self._known.add(name)
+            path = self._directory / name
             try:
                 summary = read_summary(path)
                 record = EpisodeRecord.parse(summary.metadata)
