@@ -17,9 +17,9 @@ from fetch_hand_sim.episode_log import (
     EpisodeArrays,
     EpisodeReadError,
     expand_episodes,
-    read_summary,
+    read_episode,
 )
-from fetch_hand_sim.episode_log.arrays import load_episode
+from fetch_hand_sim.episode_log.arrays import arrays_of
 from fetch_hand_sim.episode_log.files import holds_no_episode
 from node_runtime.command_line import (
     EXIT_FAILURE,
@@ -117,11 +117,10 @@ def _add(path: Path, by_task: dict[str, list[EpisodeArrays]], options: argparse.
 
     EpisodeReadError if it is unreadable or cannot share a dataset with the task's other episodes.
     """
-    # Reading a summary is much faster than reading all messages.
-    summary = read_summary(path)
-    if not is_wanted(options, summary.metadata.get('task'), summary):
+    file = read_episode(path)
+    if not is_wanted(options, file.metadata.get('task'), file):
         return False
-    episode = load_episode(path)
+    episode = arrays_of(file)
     if why := _why_left_out(episode, by_task.get(episode.spec.name, []), options.to):
         raise EpisodeReadError(f'{path}: {why}')
     by_task.setdefault(episode.spec.name, []).append(episode)

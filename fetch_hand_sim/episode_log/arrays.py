@@ -89,7 +89,11 @@ def load_episodes(
 
 def load_episode(path: Path) -> EpisodeArrays:
     """Load a bag directory or an MCAP file; EpisodeReadError if it is not a valid episode."""
-    file = read_episode(path)
+    return arrays_of(read_episode(path))
+
+
+def arrays_of(file: Episode) -> EpisodeArrays:
+    """Decode the messages of an episode; EpisodeReadError if some are missing or invalid."""
     with one_line_errors(file.path):
         return _decode(file)
 

@@ -9,7 +9,8 @@ import shutil
 import numpy as np
 import pytest
 
-from fetch_hand_sim.episode_log import EpisodeDirectory, load_episodes
+from fetch_hand_sim.episode_log import EpisodeDirectory, load_episodes, reader
+from fetch_hand_sim.episode_log.indexes import parse_file
 from policy_node.training import generate_episodes
 from support.episode_recorder import Recorder
 from support.full_disk import files_at_most
@@ -40,6 +41,13 @@ def test_parquet_holds_every_value(episodes, export, tmp_path, capsys):
     assert len(columns['step']) == 3 * 51
     assert export(episodes, 'parquet', tmp_path) == 1
     assert 'nothing is overwritten' in capsys.readouterr().err
+
+
+def test_an_export_parses_each_file_once(episodes, export, tmp_path, monkeypatch):
+    parsed = []
+    monkeypatch.setattr(reader, 'parse_file', lambda data: parsed.append(1) or parse_file(data))
+    assert export(episodes, 'parquet', tmp_path) == 0
+    assert len(parsed) == 3
 
 
 def test_minari_holds_every_value_and_recovers_the_environment(episodes, export, minari, tmp_path):
