@@ -234,12 +234,8 @@ def claim(directory: Path, name: str) -> BufferedWriter:
 def require_free_space(directory: Path, minimum_bytes: int) -> None:
     """Raise `OSError` if the disk of `directory` has less than `minimum_bytes` free."""
     status = os.statvfs(directory)
-    free = status.f_bavail * status.f_frsize
-    if free < minimum_bytes:
-        raise OSError(
-            errno.ENOSPC,
-            f'{free / _MIB:.1f} MiB free on the disk, {minimum_bytes / _MIB:.1f} MiB wanted',
-        )
+    if status.f_bavail * status.f_frsize < minimum_bytes:
+        raise OSError(errno.ENOSPC, f'less than {minimum_bytes / _MIB:g} MiB free on the disk')
 
 
 def lock(stream: IO[bytes]) -> None:
