@@ -6,11 +6,9 @@ import signal
 import sys
 import tempfile
 import time
-from types import SimpleNamespace
 
 import pytest
 
-from fetch_hand_sim.commands import demo as module
 from fetch_hand_sim.commands.node_processes import start_node, stop_node
 from fetch_hand_sim.episode_log import read_summary
 from msgs_spec.tasks import task_spec
@@ -101,15 +99,3 @@ def test_a_node_that_is_still_loaded_ends_quietly():
         log.seek(0)
         # On a fast machine the policy is loaded by then, and the log has a line about it.
         assert [line for line in log if not line.startswith('[INFO]')] == []
-
-
-def test_the_demo_lists_a_folder_of_many_episodes_twice_a_second(tmp_path, monkeypatch):
-    seconds = iter(number * 0.05 for number in range(1000))
-    monkeypatch.setattr(module, 'time', SimpleNamespace(monotonic=lambda: next(seconds)))
-    listed = []
-    monkeypatch.setattr(module.Demo, '_episodes', lambda demo: listed.append(1) or set())
-    demo = module.Demo(SimpleNamespace(task='FetchReach', episode_dir=tmp_path))
-    polls = iter([None] * 200 + [0])
-    watcher = SimpleNamespace(spin=lambda: None, has_started=True)
-    demo._watch(watcher, [SimpleNamespace(poll=lambda: next(polls))], False)
-    assert 20 <= len(listed) <= 24
