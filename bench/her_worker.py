@@ -25,7 +25,7 @@ from fetch_hand_sim.simulation import Simulation  # noqa: E402
 from policy_node.policies.policy import Policy  # noqa: E402
 from policy_node.training.configuration.recipes import recipe_config  # noqa: E402
 from policy_node.training.evaluation import FIRST_SEED, evaluate  # noqa: E402
-from policy_node.training.machine import Workers  # noqa: E402
+from policy_node.training.runs.run_folder import RunFolder  # noqa: E402
 from policy_node.training.runs.trainer import Trainer  # noqa: E402
 
 # Without end: the limit in seconds or the target ends a run.
@@ -93,7 +93,7 @@ def train_this_project(options: argparse.Namespace) -> None:
     )
     examiner = Examiner(options)
     with tempfile.TemporaryDirectory() as output:
-        trainer = Trainer(config, Path(output), Workers())
+        trainer = Trainer(RunFolder(Path(output), config))
 
         class CycleLog:
             def write(self, row: dict[str, Any]) -> None:

@@ -17,9 +17,8 @@ from policy_node.training.configuration.flat import changed, config_from_dict
 from policy_node.training.evaluation import FIRST_SEED
 from policy_node.training.experience.hindsight import RewardFunction
 from policy_node.training.learners.actor_critic import ActorCritic
-from policy_node.training.machine import Workers
 from policy_node.training.research.registry import make_sampler
-from policy_node.training.runs.run_folder import STATE_FILE
+from policy_node.training.runs.run_folder import STATE_FILE, RunFolder
 from policy_node.training.runs.trainer import Trainer
 from policy_node.training.runs.training_state import load_state, read_state
 
@@ -63,7 +62,7 @@ def measure(run: Path, episodes: int) -> list[Comparison]:
         raise ValueError(f'{run} has no values of actions: {", ".join(odd)}')
     few = {'num_envs': episodes, 'evaluation_episodes': 1, 'replay_transitions': 1}
     config = changed(config, **few, learning_starts=0, device='cpu')
-    trainer = Trainer(config, run, Workers())
+    trainer = Trainer(RunFolder(run, config))
     load_state(run / STATE_FILE, trainer.learner, trainer.modules())
     sampler = make_sampler(config, trainer.simulation.metric)
     progress = state.counters.env_steps / config.total_steps

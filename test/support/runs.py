@@ -13,7 +13,7 @@ from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.flat import value_text
 from policy_node.training.configuration.recipes import recipe_config
 from policy_node.training.evaluation import EpisodeOutcomes
-from policy_node.training.machine import Workers
+from policy_node.training.runs.run_folder import RunFolder
 from policy_node.training.runs.trainer import Trainer
 
 torch.set_num_threads(1)
@@ -44,7 +44,7 @@ def options_of(**fields: Any) -> list[str]:
 
 def trainer_of(folder: Path, **changes: Any) -> Trainer:
     """A trainer of a small run."""
-    return Trainer(small(**changes), folder, Workers())
+    return Trainer(RunFolder(folder, small(**changes)))
 
 
 def trained(folder: Path, **changes: Any) -> Trainer:

@@ -11,7 +11,6 @@ import copy
 import time
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -25,10 +24,9 @@ from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.evaluation import EpisodeOutcomes, training_seeds
 from policy_node.training.learners.actor_critic import set_learning_rate
 from policy_node.training.learners.ddpg import Critic
-from policy_node.training.machine import Workers
 from policy_node.training.research.registry import network_shape
 from policy_node.training.runs.initial_networks import InitialNetworks
-from policy_node.training.runs.run_folder import LATEST_FILE
+from policy_node.training.runs.run_folder import LATEST_FILE, RunFolder
 from policy_node.training.runs.run_log import RunLog, loss_columns
 from policy_node.training.runs.trainer import BaseTrainer
 from policy_node.training.runs.training_state import RunClock, part_of
@@ -76,23 +74,16 @@ class ImitationTrainer(BaseTrainer):
             set and `init_from` has no critic.
     """
 
-    def __init__(
-        self,
-        config: TrainConfig,
-        output: Path,
-        workers: Workers,
-        command: str,
-        source_revision: str,
-        init_from: InitialNetworks,
-    ) -> None:
-        if workers.world_size > 1:
-            raise ValueError(f'{workers.world_size} workers; algorithm imitation needs 1')
+    def __init__(self, folder: RunFolder, init_from: InitialNetworks) -> None:
+        config, count = folder.config, folder.workers.world_size
+        if count > 1:
+            raise ValueError(f'{count} workers; algorithm imitation needs 1')
         if init_from.control_hz != config.control_hz:
             raise ValueError(
                 f'{init_from.origin["name"]} was trained at {init_from.control_hz:g} Hz, this run '
                 f'has {config.control_hz:g} Hz; algorithm imitation needs equal rates'
             )
-        super().__init__(config, output, workers, command, source_revision, init_from.origin)
+        super().__init__(folder, init_from)
         self._simulations = [
             self._simulate(_scaled(config, scale), config.num_envs)
             for scale in config.disturbance_scales
@@ -139,7 +130,7 @@ class ImitationTrainer(BaseTrainer):
             outcomes = self._evaluate(is_last=bool(reason))
             reason = reason or self._reason_to_stop()
             if outcomes is not None or reason:
-                self._folder.save_actor(LATEST_FILE, self.actor, counters.env_steps)
+                self.folder.save_actor(LATEST_FILE, self.actor, counters.env_steps)
             samples = config.updates_per_cycle * config.batch_size
             seconds = max(time.monotonic() - before, 1e-9)
             row = self._row(success, outcomes, samples, seconds)
@@ -217,5 +208,5 @@ class ImitationTrainer(BaseTrainer):
             return None
         counters.next_evaluation = counters.env_steps + self.config.evaluate_every
         outcomes = self._outcomes(self.actor)
-        self._folder.keep_best(outcomes, self.actor, counters)
+        self.folder.keep_best(outcomes, self.actor, counters)
         return outcomes

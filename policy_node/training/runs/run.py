@@ -37,6 +37,7 @@ from policy_node.training.runs.run_folder import (
     NAME,
     PROGRESS_FILE,
     STATE_FILE,
+    RunFolder,
     set_former_run_aside,
 )
 from policy_node.training.runs.run_log import Row, RunLog, draw_curve, read_progress
@@ -154,7 +155,7 @@ def train_run(
         if isinstance(trainer, Trainer):
             _warn_of_memory(trainer)
         try:
-            ending = _train(trainer, output, command, caller, resume=resume)
+            ending = _train(trainer, caller, resume=resume)
         except (TrainingError, OSError) as error:
             note = f'{output} contains no checkpoint'
             if (output / STATE_FILE).is_file():
@@ -188,10 +189,11 @@ def _make_trainer(
     """
     try:
         workers = join_workers(choose_device(config.device))
+        folder = RunFolder(output, config, workers, command, source_revision())
         if config.algorithm == 'imitation':
             assert networks is not None, 'imitation starts from a policy and is not resumed'
-            return ImitationTrainer(config, output, workers, command, source_revision(), networks)
-        trainer = Trainer(config, output, workers, command, source_revision(), networks)
+            return ImitationTrainer(folder, networks)
+        trainer = Trainer(folder, networks)
         if resume:
             trainer.resume(output / STATE_FILE)
         if experience is not None:
@@ -222,12 +224,10 @@ def _warn_of_memory(trainer: Trainer) -> None:
         )
 
 
-def _train(
-    trainer: AnyTrainer, output: Path, command: str, caller: Caller | None, *, resume: bool
-) -> Ending:
-    log, config = None, trainer.config
+def _train(trainer: AnyTrainer, caller: Caller | None, *, resume: bool) -> Ending:
+    log, config, output = None, trainer.config, trainer.folder.path
     if trainer.workers.is_first:
-        _prepare_folder(trainer, output, command, resume)
+        _prepare_folder(trainer, resume)
         log = RunLog(
             output,
             config.total_steps,
@@ -258,18 +258,19 @@ def _train(
     return Ending(reason, trainer.counters, received[0] if received else 0)
 
 
-def _prepare_folder(trainer: AnyTrainer, output: Path, command: str, resume: bool) -> None:
+def _prepare_folder(trainer: AnyTrainer, resume: bool) -> None:
     """Record the command; before a new run, move files of an earlier run into a subfolder.
 
     Also warn of a run that ends before its first update, and of bfloat16 that the processor only
     emulates.
     """
+    output = trainer.folder.path
     if not resume and (note := set_former_run_aside(output)):
         complain(NAME, note)
     if not resume or trainer.counters.env_steps < trainer.config.total_steps:
         # One line for each part of the run.
         with (output / COMMAND_FILE).open('a' if resume else 'w') as file:
-            file.write(command + '\n')
+            file.write(trainer.folder.command + '\n')
         first = trainer.learner.critic_first if isinstance(trainer, Trainer) else 0
         if note := idle_note(trainer.config, first):
             complain(NAME, note)

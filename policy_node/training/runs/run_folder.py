@@ -75,12 +75,12 @@ class RunFolder:
     Attributes:
         workers: Rank of this worker. Only the first worker writes actors and the training state.
         command: Command line or call that started the run, for the record.
-        init_from: Origin of the initial networks; empty if they were random.
+        init_from: Origin of the initial networks; empty if they were random. The trainer sets it.
     """
 
     path: Path
     config: TrainConfig
-    workers: Workers
+    workers: Workers = field(default_factory=Workers)
     command: str = ''
     source_revision: str = ''
     init_from: dict[str, Any] = field(default_factory=dict)

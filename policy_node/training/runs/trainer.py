@@ -13,7 +13,6 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -36,7 +35,7 @@ from policy_node.training.evaluation import (
 from policy_node.training.experience.episode_files import load_replay
 from policy_node.training.experience.replay import Episodes
 from policy_node.training.learners.actor_critic import Losses
-from policy_node.training.machine import Workers, choose_device, split_threads
+from policy_node.training.machine import choose_device, split_threads
 from policy_node.training.research.registry import (
     make_collector,
     make_learner,
@@ -84,20 +83,14 @@ class BaseTrainer:
     """Base class of trainers. It evaluates policies, counts steps and decides when a run ends.
 
     Args:
-        origin: Origin of the initial networks, for the record; empty if they are random.
+        folder: Folder of the run, with its configuration and this worker.
+        init_from: Networks to start from; None starts from random ones.
     """
 
-    def __init__(
-        self,
-        config: TrainConfig,
-        output: Path,
-        workers: Workers,
-        command: str,
-        source_revision: str,
-        origin: dict[str, Any],
-    ) -> None:
-        self.config, self.workers, self.counters = config, workers, Counters()
-        self._folder = RunFolder(output, config, workers, command, source_revision, origin)
+    def __init__(self, folder: RunFolder, init_from: InitialNetworks | None = None) -> None:
+        self.folder, self.counters = folder, Counters()
+        self.config, self.workers = config, workers = folder.config, folder.workers
+        folder.init_from = {} if init_from is None else init_from.origin
         self._threads, torch_threads = split_threads(config)
         torch.set_num_threads(torch_threads)
         torch.manual_seed(config.seed)
@@ -176,23 +169,11 @@ class BaseTrainer:
 
 
 class Trainer(BaseTrainer):
-    """Runs the training loop of one configuration, on one of several workers.
+    """Runs the training loop of one configuration, on one of several workers."""
 
-    Args:
-        init_from: Networks to start from; None starts from random ones.
-    """
-
-    def __init__(
-        self,
-        config: TrainConfig,
-        output: Path,
-        workers: Workers,
-        command: str = '',
-        source_revision: str = '',
-        init_from: InitialNetworks | None = None,
-    ) -> None:
-        origin = {} if init_from is None else init_from.origin
-        super().__init__(config, output, workers, command, source_revision, origin)
+    def __init__(self, folder: RunFolder, init_from: InitialNetworks | None = None) -> None:
+        super().__init__(folder, init_from)
+        config, workers = self.config, self.workers
         self.simulation = self._simulate(config, workers.share(config.num_envs))
         device, generator = choose_device(config.device), self._seed(env_steps=0)
         self.learner, self.experience = make_learner(
@@ -200,7 +181,7 @@ class Trainer(BaseTrainer):
         )
         require_readable(self.learner)
         if init_from is not None:
-            with fitting(origin['name']):
+            with fitting(init_from.origin['name']):
                 tensors = init_from.completed(self.learner)
                 load_networks(tensors, self.modules())
             self._let_critic_learn_first()
@@ -237,15 +218,15 @@ class Trainer(BaseTrainer):
         soonest = counters.env_steps + self.config.evaluate_every
         counters.next_evaluation = min(counters.next_evaluation, soonest)
         self.experience.narrow(self._progress())
-        self._folder.init_from = state.extra.get('init_from', {})
+        self.folder.init_from = state.extra.get('init_from', {})
         self._let_critic_learn_first()
-        self._folder.read_best(counters)
+        self.folder.read_best(counters)
         # The state contains no simulations. Use new seeds, so that no episode is repeated.
         self.experience.generator = self._seed(counters.env_steps)
         limits = (counters.env_steps, self.config.replay_transitions, MOST_REFILLED)
         held = self.experience.replay.capacity * self.spec.episode_ticks
         self._steps_to_refill = min(self.workers.share(min(limits)), held)
-        file = self._folder.replay_file()
+        file = self.folder.replay_file()
         try:
             load_replay(file, self.experience.replay)
         except ValueError as error:
@@ -260,7 +241,7 @@ class Trainer(BaseTrainer):
 
         Do nothing if the configuration sets this number itself (`critic_first` is not 0).
         """
-        origin = self._folder.init_from
+        origin = self.folder.init_from
         critics = self.config.critics
         known = origin.get('critics', critics if origin.get('critic', True) else 0)
         if known < critics and self.config.critic_first == 0:
@@ -304,7 +285,7 @@ class Trainer(BaseTrainer):
                 if reason := self._reason_to_stop():
                     self.save()
                     return reason
-                self._folder.save_when_due(self.learner, self.experience, self.counters)
+                self.folder.save_when_due(self.learner, self.experience, self.counters)
 
     def _run_cycle(
         self, collected: Collected, executor: ThreadPoolExecutor, log: RunLog | None
@@ -331,7 +312,7 @@ class Trainer(BaseTrainer):
             collected = executor.submit(self._evaluate, collected, self._candidate()).result()
         outcomes, actor = collected.evaluation, collected.evaluated
         if outcomes and actor:
-            self._folder.keep_best(outcomes, actor, self.counters)
+            self.folder.keep_best(outcomes, actor, self.counters)
         if log is not None:
             samples = len(losses) * self.experience.batch_size * self.workers.world_size
             success, seconds = collected.train_success, time.monotonic() - before
@@ -454,7 +435,7 @@ class Trainer(BaseTrainer):
         Raises:
             OSError: If a file cannot be written; the earlier files stay.
         """
-        self._folder.save(self.learner, self.experience, self.counters)
+        self.folder.save(self.learner, self.experience, self.counters)
 
 
 @contextmanager

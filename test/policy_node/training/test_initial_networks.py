@@ -14,7 +14,6 @@ from policy_node.policies import checkpoint
 from policy_node.policies.files import read_tensors, write_tensors
 from policy_node.policies.loading import load_actor, shipped_actors
 from policy_node.training.configuration.recipes import recipe_config
-from policy_node.training.machine import Workers
 from policy_node.training.research.registry import network_shape
 from policy_node.training.runs.imitation import Answers, ImitationTrainer
 from policy_node.training.runs.initial_networks import (
@@ -22,7 +21,7 @@ from policy_node.training.runs.initial_networks import (
     read_initial_networks,
     steps_behind,
 )
-from policy_node.training.runs.run_folder import STATE_FILE
+from policy_node.training.runs.run_folder import STATE_FILE, RunFolder
 from policy_node.training.runs.run_log import read_progress
 from policy_node.training.runs.trainer import Trainer
 from policy_node.training.runs.training_state import part_of
@@ -51,14 +50,14 @@ def block_run(tmp_path_factory):
 
 
 def start(folder, config, networks):
-    return Trainer(config, folder, Workers(), init_from=networks)
+    return Trainer(RunFolder(folder, config), networks)
 
 
 def test_a_run_starts_with_all_networks_of_another(tmp_path, block_run):
     networks = read_initial_networks(str(block_run))
     config = tiny('HandManipulateBlockFull')
     networks.require_fit(config)
-    source = Trainer(tiny(BLOCK), tmp_path, Workers())
+    source = Trainer(RunFolder(tmp_path, tiny(BLOCK)))
     source.resume(block_run / 'training_state.safetensors')
     started = start(tmp_path, config, networks)
     for name in ('actor', 'critic', 'target_actor', 'target_critic', 'average_actor'):
@@ -82,7 +81,7 @@ def test_the_evaluated_actor_keeps_a_share_of_its_start(tmp_path, block_run):
     evaluated = trainer.learner.evaluation_actor().network.state_dict()
     for name, value in evaluated.items():
         torch.testing.assert_close(value, 0.25 * first[name] + 0.75 * last[name])
-    resumed = Trainer(config, tmp_path, Workers())
+    resumed = Trainer(RunFolder(tmp_path, config))
     resumed.resume(tmp_path / 'training_state.safetensors')
     assert same(resumed.learner.evaluation_actor().network.state_dict(), evaluated)
 
@@ -90,7 +89,7 @@ def test_the_evaluated_actor_keeps_a_share_of_its_start(tmp_path, block_run):
 @pytest.mark.parametrize('features', ['relative', 'symmetric'])
 def test_a_position_that_now_counts_has_no_effect_at_first(tmp_path, block_run, features):
     """EggFull from EggRotate: actor and critic return the same for every goal position."""
-    before = Trainer(tiny('HandManipulateEggRotate', goal_features=features), tmp_path, Workers())
+    before = Trainer(RunFolder(tmp_path, tiny('HandManipulateEggRotate', goal_features=features)))
     before.save()
     config = tiny('HandManipulateEggFull', goal_features=features)
     networks = read_initial_networks(str(tmp_path))
@@ -173,7 +172,7 @@ def test_without_targets_a_run_starts_from_the_networks_themselves(tmp_path, blo
     slow = part_of(networks.tensors, 'target_critic')
     assert not same(before['critic'], slow)
     started = start(tmp_path, tiny(BLOCK, target='none'), networks).learner
-    again = Trainer(tiny(BLOCK, target='none'), tmp_path, Workers())
+    again = Trainer(RunFolder(tmp_path, tiny(BLOCK, target='none')))
     again.resume(block_run / STATE_FILE)
     for learner in (started, again.learner):
         assert same(learner.actor.state_dict(), before['actor'])
@@ -346,7 +345,7 @@ LATE = '{"action": {"latency": 1}}'
 
 def trainer_of(config, folder):
     networks = read_initial_networks(config.task).fitted(config)
-    return ImitationTrainer(config, folder, Workers(), '', '', networks)
+    return ImitationTrainer(RunFolder(folder, config), networks)
 
 
 def test_each_input_is_answered_in_the_state_in_which_the_action_arrives(tmp_path):

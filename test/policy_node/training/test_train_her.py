@@ -335,7 +335,7 @@ def test_the_best_actor_is_kept_and_ties_go_to_the_better_return(tmp_path):
         outcomes = outcomes_of(np.arange(count) < successes, episode_return=returns)
         trainer.counters.env_steps = steps
         actor = trainer.learner.evaluation_actor()
-        trainer._folder.keep_best(outcomes, actor, trainer.counters)
+        trainer.folder.keep_best(outcomes, actor, trainer.counters)
         return checkpoint.read_info(tmp_path / 'best.safetensors').env_steps
 
     assert evaluated(1, 2, -9.0) == 1
