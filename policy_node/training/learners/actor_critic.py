@@ -41,6 +41,10 @@ class ActorCritic:
 
     Args:
         workers: Processes that train together; gradients are averaged over them.
+
+    Attributes:
+        modules: Modules to save in the training state, by name. Subclasses add theirs.
+        optimizers: Optimizers to save in the training state, by name. Subclasses add theirs.
     """
 
     def __init__(
@@ -63,6 +67,17 @@ class ActorCritic:
         self.start_actor = copy.deepcopy(self.actor.network) if config.start_share else None
         self.actor_optimizer = self._adam(self.actor_parameters)
         self.critic_optimizer = self._adam(self.critic_parameters)
+        self.modules: dict[str, nn.Module] = {
+            'actor': self.actor,
+            'critic': self.critic,
+            'average_actor': self.average_actor,
+        }
+        if self.start_actor is not None:
+            self.modules['start_actor'] = self.start_actor
+        self.optimizers = {
+            'actor_optimizer': self.actor_optimizer,
+            'critic_optimizer': self.critic_optimizer,
+        }
         self.critic_first = config.critic_first
         self.updates = 0
 
@@ -116,19 +131,6 @@ class ActorCritic:
         actor = copy.deepcopy(self.actor)
         actor.network.load_state_dict(network.state_dict())
         return actor.cpu().eval()
-
-    def modules(self) -> dict[str, nn.Module]:
-        """Return the modules to save in the training state, by name."""
-        start = {} if self.start_actor is None else {'start_actor': self.start_actor}
-        own = {'actor': self.actor, 'critic': self.critic, 'average_actor': self.average_actor}
-        return own | start
-
-    def optimizers(self) -> dict[str, torch.optim.Adam]:
-        """Return the optimizers to save in the training state, by name."""
-        return {
-            'actor_optimizer': self.actor_optimizer,
-            'critic_optimizer': self.critic_optimizer,
-        }
 
     def set_progress(self, progress: float) -> None:
         """Set both learning rates to those at `progress`, the finished share of the run."""

@@ -117,6 +117,8 @@ class DDPG(ActorCritic):
         if self._has_targets:
             self.target_actor = copy.deepcopy(self.target_actor)
             self.target_critic = copy.deepcopy(self.target_critic)
+            self.modules['target_actor'] = self.target_actor
+            self.modules['target_critic'] = self.target_critic
         self._bfloat16 = uses_bfloat16(config.precision, device)
         # Loss and value of the last update of the actor.
         self._of_actor = (torch.zeros((), device=device),) * 2
@@ -209,11 +211,6 @@ class DDPG(ActorCritic):
         del batch
         cost: Tensor = self.config.action_l2 * action.float().square().mean()
         return cost
-
-    def modules(self) -> dict[str, nn.Module]:
-        """Return the modules to save in the training state, by name."""
-        targets = {'target_actor': self.target_actor, 'target_critic': self.target_critic}
-        return super().modules() | (targets if self._has_targets else {})
 
     def precision(self) -> contextlib.AbstractContextManager[None]:
         """Return a context in which matrix products use bfloat16, if `precision` selects it."""

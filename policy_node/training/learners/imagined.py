@@ -44,6 +44,8 @@ class ImaginingDDPG(DDPG):
         self._imagination_parameters = list(self.imagination.parameters())
         self.workers.broadcast(self._imagination_parameters)
         self._imagination_optimizer = self._adam(self._imagination_parameters)
+        self.modules['imagination'] = self.imagination
+        self.optimizers['imagination_optimizer'] = self._imagination_optimizer
         spec = task_spec(self.config.task)
         start = spec.achieved_goal_start
         self._achieved = slice(start, start + shape.goal_size)
@@ -106,11 +108,3 @@ class ImaginingDDPG(DDPG):
             return subgoal
         rotation = nn.functional.normalize(subgoal[:, 3:], dim=-1)
         return torch.cat([subgoal[:, :3], rotation], dim=-1)
-
-    def modules(self) -> dict[str, nn.Module]:
-        """Return the modules to save in the training state, by name."""
-        return {**super().modules(), 'imagination': self.imagination}
-
-    def optimizers(self) -> dict[str, torch.optim.Adam]:
-        """Return the optimizers to save in the training state, by name."""
-        return {**super().optimizers(), 'imagination_optimizer': self._imagination_optimizer}

@@ -104,6 +104,8 @@ class WeightedDDPG(DDPG):
     def _set_up(self, shape: NetworkShape) -> None:
         sizes = shape.feature_size, shape.goal_size, shape.action_size
         self._ratio = DensityRatio(*sizes).to(self.device)
+        self.modules['ratio'] = self._ratio
+        self.optimizers['ratio_optimizer'] = self._ratio.optimizer
         start = task_spec(self.config.task).achieved_goal_start
         self._achieved = slice(start, start + shape.goal_size)
 
@@ -134,11 +136,3 @@ class WeightedDDPG(DDPG):
         """Train the classifiers on a NumPy batch, without actor and critic; return its weights."""
         weight: Array32 = self._weights(self.tensors(batch)).cpu().numpy()
         return weight
-
-    def modules(self) -> dict[str, nn.Module]:
-        """Return the modules to save in the training state, by name."""
-        return {**super().modules(), 'ratio': self._ratio}
-
-    def optimizers(self) -> dict[str, torch.optim.Adam]:
-        """Return the optimizers to save in the training state, by name."""
-        return {**super().optimizers(), 'ratio_optimizer': self._ratio.optimizer}

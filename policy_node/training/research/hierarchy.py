@@ -19,9 +19,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import ArrayLike, NDArray
-from torch import nn
 
 from fetch_hand_sim.simulation import Simulation
 from msgs_spec.arrays import Array32
@@ -164,8 +162,6 @@ _DECISIONS = 0.3
 _SUBGOAL = 'subgoal'
 # Goal sources of the low level.
 LOW_SOURCES = {**SOURCES, _SUBGOAL: subgoals_of}
-# Prefix of the parts of the high level in a training state.
-_HIGH = 'high_'
 
 
 def with_subgoals(mixture: dict[str, float]) -> dict[str, float]:
@@ -297,6 +293,8 @@ class HierarchicalDDPG(DDPG):
 
     def _set_up(self, shape: NetworkShape) -> None:
         self.high = HighLevel(shape, self)
+        self.modules |= {f'high_{n}': module for n, module in self.high.modules.items()}
+        self.optimizers |= {f'high_{n}': each for n, each in self.high.optimizers.items()}
 
     def update(self, batch: Transitions) -> Losses:
         """Update both levels on a batch; return the losses of the actor and its critic."""
@@ -331,13 +329,3 @@ class HierarchicalDDPG(DDPG):
     def _guided(self, actor: Policy, proposer: Proposer) -> GuidedPolicy:
         spec = task_spec(self.config.task, control_hz=self.config.control_hz)
         return GuidedPolicy(actor, proposer, self.config.subgoal_every, spec.episode_ticks)
-
-    def modules(self) -> dict[str, nn.Module]:
-        """Return the modules to save in the training state, by name."""
-        high = {f'{_HIGH}{name}': module for name, module in self.high.modules().items()}
-        return {**super().modules(), **high}
-
-    def optimizers(self) -> dict[str, torch.optim.Adam]:
-        """Return the optimizers to save in the training state, by name."""
-        high = {f'{_HIGH}{name}': value for name, value in self.high.optimizers().items()}
-        return {**super().optimizers(), **high}

@@ -158,7 +158,7 @@ class InitialNetworks:
     def completed(self, learner: ActorCritic) -> dict[str, Tensor]:
         """Return `tensors`; if they have critics, but too few, add critics of `learner`."""
         tensors = dict(self.tensors)
-        for part, module in learner.modules().items():
+        for part, module in learner.modules.items():
             if given := members_of(part_of(self.tensors, part)):
                 own = members_of(module.state_dict())
                 complete = as_one(given + own[len(given) :], len(own))

@@ -189,7 +189,7 @@ class Trainer(BaseTrainer):
 
     def modules(self) -> dict[str, nn.Module]:
         """Return networks and normalizer statistics by their names in a training state."""
-        return {**self.learner.modules(), **self.experience.statistics}
+        return {**self.learner.modules, **self.experience.statistics}
 
     def _seed(self, env_steps: int) -> np.random.Generator:
         """Replace `collector` by a new one; return a random generator for drawing batches.
@@ -424,7 +424,7 @@ class Trainer(BaseTrainer):
         named = [('critic loss', torch.tensor([each.critic for each in losses]))]
         named += [('actor loss', torch.tensor([each.actor for each in losses]))]
         # The loss before the last step may be finite and the weights after it not.
-        for part, module in self.learner.modules().items():
+        for part, module in self.learner.modules.items():
             named += [(f'{part}.{n}', value.cpu()) for n, value in module.state_dict().items()]
         require_finite(named, self.counters)
         return losses

@@ -99,10 +99,10 @@ def save_state(
     `statistics` are the modules of the normalizers by name; for `extra` see `TrainingState`.
     """
     tensors: dict[str, Tensor] = {'torch_generator': torch.get_rng_state()}
-    for part, module in {**learner.modules(), **statistics}.items():
+    for part, module in {**learner.modules, **statistics}.items():
         for name, value in module.state_dict().items():
             tensors[f'{part}.{name}'] = value.detach().cpu()
-    for part, optimizer in learner.optimizers().items():
+    for part, optimizer in learner.optimizers.items():
         for index, state in optimizer.state_dict()['state'].items():
             for name, value in state.items():
                 tensors[f'{part}.{index}.{name}'] = value.detach().cpu()
@@ -125,7 +125,7 @@ def require_readable(learner: ActorCritic) -> None:
     The actor file may have 64 MiB, the training state file 1 GiB. Larger files cannot be read.
     """
     actor = sum(value.nbytes for value in learner.actor.state_dict().values())
-    modules, optimizers = learner.modules().values(), learner.optimizers().values()
+    modules, optimizers = learner.modules.values(), learner.optimizers.values()
     state = sum(value.nbytes for module in modules for value in module.state_dict().values())
     # Adam keeps two numbers for each.
     state += 2 * sum(v.nbytes for each in optimizers for v in each.param_groups[0]['params'])
@@ -212,7 +212,7 @@ def load_state(path: Path, learner: ActorCritic, modules: dict[str, nn.Module]) 
     with fitting(path):
         torch.set_rng_state(state.tensors['torch_generator'])
         load_networks(state.tensors, modules)
-        for part, optimizer in learner.optimizers().items():
+        for part, optimizer in learner.optimizers.items():
             _load_optimizer(optimizer, part_of(state.tensors, part))
         if state.counters.updates > 0 and not part_of(state.tensors, 'critic_optimizer'):
             raise ValueError('critic_optimizer is missing')

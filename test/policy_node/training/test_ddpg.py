@@ -132,7 +132,7 @@ def test_learning_rates_fall_linearly_to_the_share_asked_for():
     learner = make_learner(learning_rate=2e-3, final_learning_rate=0.1)
     for progress, expected in ((0.0, 2e-3), (0.5, 1.1e-3), (1.0, 2e-4), (1.5, 2e-4)):
         learner.set_progress(progress)
-        for optimizer in learner.optimizers().values():
+        for optimizer in learner.optimizers.values():
             assert optimizer.param_groups[0]['lr'] == pytest.approx(expected)
 
 

@@ -56,7 +56,7 @@ def test_the_high_level_proposes_and_learns_goals_on_the_same_scale() -> None:
         batch = Transitions(zero, zero, zero, goals, zero[:, 0], zero[:, 0])
         np.testing.assert_allclose(learner.high.tensors(batch).action, np.tanh(bias), rtol=1e-5)
     learner.set_progress(1.0)
-    rates = [optimizer.param_groups[0]['lr'] for optimizer in learner.optimizers().values()]
+    rates = [optimizer.param_groups[0]['lr'] for optimizer in learner.optimizers.values()]
     assert rates == pytest.approx([0.1 * config.learning_rate] * 4)
 
 
