@@ -75,6 +75,10 @@ class Experience:
         extra_columns: Number of values stored with each action in addition, such as a subgoal.
         weigh: Function that returns the weight of each episode. The share `moved_share` of a batch
             is drawn by these weights, the rest without them.
+
+    Attributes:
+        batch_sampler: Sampler of the batches, at first `sampler`. It may depend on the learner; the
+            statistics always use `sampler`.
     """
 
     def __init__(
@@ -90,7 +94,7 @@ class Experience:
         self.config = config
         self._spec = spec
         self._workers = workers
-        self._sampler = sampler
+        self._sampler = self.batch_sampler = sampler
         self._weigh = weigh
         self.generator = generator
         self.batch_size = workers.share(config.batch_size)
@@ -138,18 +142,17 @@ class Experience:
     def narrow(self, progress: float) -> None:
         """Set the reward thresholds for `progress`, the finished share 0 ... 1 of the run."""
         self._sampler = self._sampler.at(progress)
+        self.batch_sampler = self.batch_sampler.at(progress)
 
     def batch(self) -> Transitions:
         """Draw the transitions for one update and relabel their goals."""
-        return self._draw(self.mixture())
+        return self._draw(self.mixture(), self.batch_sampler)
 
-    def _draw(
-        self, mixture: dict[str, float], sampler: TransitionSampler | None = None
-    ) -> Transitions:
-        """Draw a batch with goals from `mixture`, by `sampler` or by the sampler of this object."""
-        chosen, replay = sampler or self._sampler, self.replay
+    def _draw(self, mixture: dict[str, float], sampler: TransitionSampler) -> Transitions:
+        """Draw a batch with goals from `mixture` by `sampler`."""
+        replay = self.replay
         row = replay.draw(self.batch_size, self.config.moved_share, self.generator)
-        return chosen.sample(replay.episodes, row, mixture, self.generator, replay.valid_ticks)
+        return sampler.sample(replay.episodes, row, mixture, self.generator, replay.valid_ticks)
 
     def mixture(self) -> dict[str, float]:
         """Return the probability of each goal source; they add up to 1."""

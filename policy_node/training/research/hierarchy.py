@@ -249,7 +249,7 @@ class HierarchicalExperience(Experience):
     def batch(self) -> HierarchicalTransitions:
         """Draw the transitions of one update of both levels."""
         config, mixture = self.config, self.mixture()
-        low = self._draw(with_subgoals(mixture))
+        low = self._draw(with_subgoals(mixture), self.batch_sampler)
         subgoals = SubgoalSampler(
             compute_reward=self._sampler.compute_reward,
             gamma=self._sampler.gamma,

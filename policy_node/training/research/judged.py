@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 
 from msgs_spec.arrays import Array32
 from policy_node.policies.actor import Actor
-from policy_node.training.experience.experience import Experience
 from policy_node.training.experience.hindsight import SOURCES, draw_sources, goals_of
 from policy_node.training.experience.replay import Starts, Transitions
 from policy_node.training.experience.sampling import TransitionSampler
@@ -134,22 +133,3 @@ class CuttingSampler(TransitionSampler):
             distance = np.sqrt(np.square(taken - own).mean(axis=-1))
             steps[going[distance <= self.cut_distance]] += 1
         return steps
-
-
-class JudgedExperience(Experience):
-    """Experience whose batches come from a sampler that depends on the learner.
-
-    Attributes:
-        judged: The sampler of the batches. Statistics of normalizers use a plain sampler.
-    """
-
-    judged: TransitionSampler
-
-    def narrow(self, progress: float) -> None:
-        """Set the reward thresholds to those at `progress`, the finished share of the run."""
-        super().narrow(progress)
-        self.judged = self.judged.at(progress)
-
-    def batch(self) -> Transitions:
-        """Draw the transitions for one update from `judged`."""
-        return self._draw(self.mixture(), self.judged)

@@ -139,11 +139,9 @@ def make_learner(
     if config.subgoal_every:
         # The subgoal, and whether it is tested.
         return learner, hierarchy.HierarchicalExperience(*common, spec.goal.size + 1, weigh)
-    if config.goal_choice != 'uniform' or config.correction == 'cut':
-        experience = judged.JudgedExperience(*common, weigh=weigh)
-        experience.judged = make_sampler(config, metric, learner)
-        return learner, experience
-    return learner, Experience(*common, _extra_actions(config), weigh)
+    experience = Experience(*common, _extra_actions(config), weigh)
+    experience.batch_sampler = make_sampler(config, metric, learner)
+    return learner, experience
 
 
 def make_ddpg(
