@@ -149,16 +149,18 @@ def set_learning_rate(optimizer: torch.optim.Adam, config: TrainConfig, progress
     optimizer.param_groups[0]['lr'] = rate
 
 
-def network_shape(config: TrainConfig, extra_actions: int = 0) -> NetworkShape:
-    """Return the sizes and inputs of the networks that `config` describes.
+def extra_actions(config: TrainConfig) -> int:
+    """Return 1 if the actor also outputs how long its action is held, else 0."""
+    return int(config.longest_hold > 1)
 
-    `extra_actions` is the number of actor outputs beside the robot's action.
-    """
+
+def network_shape(config: TrainConfig) -> NetworkShape:
+    """Return the sizes and inputs of actor and critic that the configuration selects."""
     spec = task_spec(config.task)
     return NetworkShape(
         observation_size=spec.observation_size,
         goal_size=spec.goal.size,
-        action_size=spec.robot.action_size + extra_actions,
+        action_size=spec.robot.action_size + extra_actions(config),
         hidden_sizes=config.hidden_sizes,
         layer_norm=config.layer_norm,
         goal_features=goal_features(config.goal_features, spec),

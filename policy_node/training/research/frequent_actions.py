@@ -12,7 +12,6 @@ from torch import Tensor
 
 from fetch_hand_sim.simulation import Simulation
 from msgs_spec.arrays import Array32
-from msgs_spec.tasks import task_spec
 from policy_node.policies.actor import Actor
 from policy_node.policies.policy import MemorylessPolicy, Policy
 from policy_node.training.configuration.config import TrainConfig
@@ -88,20 +87,13 @@ class HoldingDDPG(DDPG):
 
     def evaluation_actor(self) -> Actor:
         """Return the actor to evaluate, without the output for how long an action holds."""
-        return plain_actor(super().evaluation_actor(), self.config)
-
-
-def plain_actor(actor: Actor, config: TrainConfig) -> Actor:
-    """Return `actor`, or a copy without the output for how long an action holds if it has one."""
-    action_size = task_spec(config.task).robot.action_size
-    if actor.shape.action_size == action_size:
-        return actor
-    plain = Actor(replace(actor.shape, action_size=action_size))
-    state = actor.state_dict()
-    for name in ('network.output.weight', 'network.output.bias'):
-        state[name] = state[name][:action_size].clone()
-    plain.load_state_dict(state)
-    return plain.eval()
+        actor = super().evaluation_actor()
+        plain = Actor(replace(actor.shape, action_size=actor.shape.action_size - 1))
+        state = actor.state_dict()
+        for name in ('network.output.weight', 'network.output.bias'):
+            state[name] = state[name][:-1].clone()
+        plain.load_state_dict(state)
+        return plain.eval()
 
 
 # Perturbed copies that collect side by side, each in its share of the simulations.

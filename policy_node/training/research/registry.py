@@ -19,8 +19,7 @@ from policy_node.training.experience.collector import Collector
 from policy_node.training.experience.experience import Experience
 from policy_node.training.experience.replay import Weigh, has_moved
 from policy_node.training.experience.sampling import TransitionSampler, sampler_fields
-from policy_node.training.learners import actor_critic
-from policy_node.training.learners.actor_critic import ActorCritic
+from policy_node.training.learners.actor_critic import ActorCritic, extra_actions, network_shape
 from policy_node.training.learners.ddpg import DDPG
 from policy_node.training.learners.imagined import ImaginingDDPG
 from policy_node.training.machine import Workers
@@ -36,7 +35,6 @@ from policy_node.training.research import (
 )
 from policy_node.training.research.conditions import acting_input, without_input
 from policy_node.training.research.critics import as_one, members_of
-from policy_node.training.research.frequent_actions import plain_actor
 from policy_node.training.research.ppo import PPO
 
 __all__ = [
@@ -48,8 +46,6 @@ __all__ = [
     'make_sampler',
     'make_simulation',
     'members_of',
-    'network_shape',
-    'plain_actor',
     'without_input',
 ]
 
@@ -139,7 +135,7 @@ def make_learner(
     if config.subgoal_every:
         # The subgoal, and whether it is tested.
         return learner, hierarchy.HierarchicalExperience(*common, spec.goal.size + 1, weigh)
-    experience = Experience(*common, _extra_actions(config), weigh)
+    experience = Experience(*common, extra_actions(config), weigh)
     experience.batch_sampler = make_sampler(config, metric, learner)
     return learner, experience
 
@@ -150,16 +146,6 @@ def make_ddpg(
     """Return the learner that the configuration selects, `DDPG` or a variant of it."""
     kinds = (kind for name, kind in _LEARNERS.items() if getattr(config, name) != DEFAULTS[name])
     return next(kinds, DDPG)(shape, config, device, workers, critics.critic_loss(config))
-
-
-def network_shape(config: TrainConfig) -> NetworkShape:
-    """Return the sizes and inputs of actor and critic that the configuration selects."""
-    return actor_critic.network_shape(config, _extra_actions(config))
-
-
-def _extra_actions(config: TrainConfig) -> int:
-    """Return 1 if the actor also outputs how long its action is held, else 0."""
-    return int(config.longest_hold > 1)
 
 
 def _weights_of(config: TrainConfig, spec: TaskSpec) -> Weigh:

@@ -22,9 +22,8 @@ from policy_node.policies.actor import Actor
 from policy_node.policies.policy import past_after
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.evaluation import EpisodeOutcomes, training_seeds
-from policy_node.training.learners.actor_critic import set_learning_rate
+from policy_node.training.learners.actor_critic import network_shape, set_learning_rate
 from policy_node.training.learners.ddpg import Critic
-from policy_node.training.research.registry import network_shape
 from policy_node.training.runs.initial_networks import InitialNetworks
 from policy_node.training.runs.run_folder import LATEST_FILE, RunFolder
 from policy_node.training.runs.run_log import RunLog, loss_columns

@@ -16,12 +16,16 @@ from policy_node.policies.loading import actor_path
 from policy_node.policies.network_shape import NetworkShape
 from policy_node.training.configuration.config import TrainConfig, unusual_networks
 from policy_node.training.configuration.flat import config_from_dict
-from policy_node.training.learners.actor_critic import ActorCritic, first_weights, with_inputs
+from policy_node.training.learners.actor_critic import (
+    ActorCritic,
+    first_weights,
+    network_shape,
+    with_inputs,
+)
 from policy_node.training.research.registry import (
     acting_input,
     as_one,
     members_of,
-    network_shape,
     without_input,
 )
 from policy_node.training.runs.run_folder import LATEST_FILE, STATE_FILE, companion_file

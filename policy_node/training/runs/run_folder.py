@@ -20,7 +20,6 @@ from policy_node.training.experience.episode_files import save_replay
 from policy_node.training.experience.experience import Experience
 from policy_node.training.learners.actor_critic import ActorCritic
 from policy_node.training.machine import Workers
-from policy_node.training.research.registry import plain_actor
 from policy_node.training.runs.training_state import Counters, is_finite, save_state
 
 NAME = 'fetch_hand_sim train'
@@ -200,4 +199,4 @@ class RunFolder:
             init_from=self.init_from,
             past_actions=config.past_actions,
         )
-        checkpoint.save(self.path / name, plain_actor(actor, config), info)
+        checkpoint.save(self.path / name, actor, info)

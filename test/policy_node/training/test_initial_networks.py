@@ -14,7 +14,7 @@ from policy_node.policies import checkpoint
 from policy_node.policies.files import read_tensors, write_tensors
 from policy_node.policies.loading import load_actor, shipped_actors
 from policy_node.training.configuration.recipes import recipe_config
-from policy_node.training.research.registry import network_shape
+from policy_node.training.learners.actor_critic import network_shape
 from policy_node.training.runs.imitation import Answers, ImitationTrainer
 from policy_node.training.runs.initial_networks import (
     CRITIC_FIRST,
