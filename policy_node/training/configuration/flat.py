@@ -48,8 +48,8 @@ RESEARCH = (
     'imagination_interval ticks_after_drop drop_is_lost reward_grades critic_first start_share '
     'disturbance_scales'
 ).split()
-# Former and shorter names of options.
-_OTHER_NAMES = {'total_steps': ('--steps',), 'simulation_threads': ('--threads',)}
+# Shorter names of options.
+_SHORT = {'total_steps': '--steps', 'simulation_threads': '--threads'}
 
 
 def to_flat(config: TrainConfig) -> dict[str, Any]:
@@ -242,12 +242,12 @@ def add_field_options(parser: argparse.ArgumentParser, without: tuple[str, ...])
         if name in without:
             continue
         if name in RESEARCH:
-            _add_option(research, each)
-            _add_option(parser, dataclasses.replace(each, meaning=argparse.SUPPRESS))
+            add_field_option(research, each)
+            add_field_option(parser, dataclasses.replace(each, meaning=argparse.SUPPRESS))
             continue
         if each.group not in groups:
             groups[each.group] = parser.add_argument_group(each.group)
-        _add_option(groups[each.group], each)
+        add_field_option(groups[each.group], each)
 
 
 class _ResearchHelp(argparse.Action):
@@ -262,8 +262,15 @@ class _ResearchHelp(argparse.Action):
         parser.exit()
 
 
-def _add_option(group: Any, each: Field) -> None:
-    names = (*_OTHER_NAMES.get(each.name, ()), f'--{each.name.replace("_", "-")}')
+def _option_names(name: str) -> list[str]:
+    """Return the options of a field, the shorter one first."""
+    short = [_SHORT[name]] if name in _SHORT else []
+    return [*short, f'--{name.replace("_", "-")}']
+
+
+def add_field_option(group: Any, each: Field) -> None:
+    """Add the option for a field to a parser or a group of options."""
+    names = _option_names(each.name)
     options: dict[str, Any] = {'dest': each.name, 'help': each.meaning.replace('%', '%%')}
     if each.kind is bool:
         group.add_argument(*names, action=argparse.BooleanOptionalAction, **options)
@@ -285,14 +292,11 @@ def given_fields(options: argparse.Namespace) -> dict[str, Any]:
     return {n: value for n, value in vars(options).items() if n in FIELDS and value is not None}
 
 
-def with_assignments(
-    given: dict[str, Any], assignments: Iterable[str], options: Mapping[str, str] | None = None
-) -> dict[str, Any]:
+def with_assignments(given: dict[str, Any], assignments: Iterable[str]) -> dict[str, Any]:
     """Return the values given by options and by `--set`, by field.
 
     Args:
         assignments: Texts `name=value` of `--set`; the last one for a field counts.
-        options: Option names by field, for error messages; by default the field's name with dashes.
 
     Raises:
         ValueError: If an assignment is invalid or contradicts the option of its field.
@@ -300,6 +304,6 @@ def with_assignments(
     assigned = dict(parse_assignment(text) for text in assignments)
     for name, value in assigned.items():
         if name in given and given[name] != value:
-            option = (options or {}).get(name, f'--{name.replace("_", "-")}')
-            raise ValueError(f'{option} {given[name]} excludes --set {name}={value_text(value)}')
+            option = f'{_option_names(name)[0]} {given[name]}'
+            raise ValueError(f'{option} excludes --set {name}={value_text(value)}')
     return {**given, **assigned}

@@ -42,7 +42,12 @@ from node_runtime.command_line import (
 )
 from policy_node.policies.files import write_file
 from policy_node.policies.loading import is_python_name, working_directory_first
-from policy_node.training.configuration.flat import whole, with_assignments
+from policy_node.training.configuration.config import FIELDS
+from policy_node.training.configuration.flat import (
+    add_field_option,
+    given_fields,
+    with_assignments,
+)
 from policy_node.training.runs.shipping import ship
 from policy_node.training.studies.best import BEST
 from policy_node.training.studies.published import actors_table
@@ -62,8 +67,8 @@ from policy_node.training.studies.workers import (
 _NAME = 'fetch_hand_sim benchmark'
 ACTORS_TABLE = 'actors.md'
 _STUDIES = {**STUDIES, BEST.name: BEST}
-# Options of `TrainConfig` fields with another name.
-_OPTIONS = {'total_steps': '--steps', 'simulation_threads': '--threads'}
+# Fields of `TrainConfig` with an option; `--set` sets the others.
+_FIELD_OPTIONS = ('total_steps', 'simulation_threads', 'torch_threads')
 
 
 def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
@@ -81,9 +86,8 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     add('--arms', nargs='+', metavar='ARM', help='variants; default: all')
     count = whole_number(1)
     add('--jobs', type=count, help='runs trained in parallel; default: 1; one per core')
-    add('--steps', type=_whole, help='environment steps of each job')
-    add('--threads', type=_whole, help='simulation threads of each job')
-    add('--torch-threads', type=_whole, help='tensor threads of each job')
+    for name in _FIELD_OPTIONS:
+        add_field_option(parser, FIELDS[name])
     add('--set', action='append', default=[], metavar='NAME=VALUE', help='any field of TrainConfig')
     add('--output', type=Path, help='default: runs/research/NAME or runs/best')
     add('--report', type=Path, help='of figure and tables; default: docs/research/NAME or --output')
@@ -91,13 +95,6 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     add('--ray', action='store_true', help='independent jobs on Ray (extra: cluster)')
     add('--actors', type=Path, help='folder of actors of study best; default: <output>/actors')
     return parser.parse_args(arguments)
-
-
-def _whole(text: str) -> int:
-    try:
-        return whole(text)
-    except (ValueError, OverflowError):
-        raise argparse.ArgumentTypeError(f'{text[:80]!r} is no whole number') from None
 
 
 def find_study(name: str) -> Study:
@@ -157,13 +154,7 @@ def jobs_from_arguments(options: argparse.Namespace) -> list[Job]:
 
 def _overrides(options: argparse.Namespace, study: Study) -> dict[str, Any]:
     """Return the `TrainConfig` fields that the options set for all jobs, or raise ValueError."""
-    chosen = {
-        'total_steps': options.steps,
-        'simulation_threads': options.threads,
-        'torch_threads': options.torch_threads,
-    }
-    given = {name: value for name, value in chosen.items() if value is not None}
-    overrides = with_assignments(given, options.set, _OPTIONS)
+    overrides = with_assignments(given_fields(options), options.set)
     decided = {'task', 'recipe', 'seed', 'init_from'}.union(*(arm.own for arm in study.arms))
     for name in overrides:
         if name in decided:
