@@ -9,13 +9,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from fetch_hand_sim.simulation import Simulation
-from msgs_spec.arrays import Array32
-from policy_node.policies.policy import past_after
 from policy_node.training.configuration.config import changed_fields
 from policy_node.training.configuration.flat import changed, config_from_dict
 from policy_node.training.evaluation import FIRST_SEED
-from policy_node.training.experience.hindsight import RewardFunction
+from policy_node.training.experience.collector import Collector
+from policy_node.training.experience.replay import Episodes
 from policy_node.training.learners.actor_critic import ActorCritic
 from policy_node.training.research.registry import make_sampler
 from policy_node.training.runs.run_folder import STATE_FILE, RunFolder
@@ -67,46 +65,35 @@ def measure(run: Path, episodes: int) -> list[Comparison]:
     sampler = make_sampler(config, trainer.simulation.metric)
     progress = state.counters.env_steps / config.total_steps
     compute_reward = sampler.at(progress).compute_reward
-    values, rewards = _play(trainer.simulation, trainer.learner, compute_reward)
+    played = _play(trainer)
+    achieved, goal = (
+        each.astype(np.float64) for each in (played.achieved_goal, played.desired_goal)
+    )
+    rewards = np.array(
+        [compute_reward(achieved[:, tick + 1], goal) for tick in range(played.ticks)]
+    )
     returns = discounted(rewards * sampler.reward_scale, config.tick_gamma)
-    ticks = [int(share * len(values)) for share in _SHARES]
+    ticks = [int(share * played.ticks) for share in _SHARES]
+    values = {tick: _values(trainer.learner, played, tick) for tick in ticks}
     return [_compared(tick, values[tick], returns[tick]) for tick in ticks]
 
 
-def _play(
-    simulation: Simulation, learner: ActorCritic, compute_reward: RewardFunction
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Run an episode in each simulation; return critic values and rewards (ticks, episodes)."""
-    count = simulation.num_envs
-    observation = simulation.reset(seed=[FIRST_SEED + index for index in range(count)])
-    past = np.zeros((count, learner.actor.shape.past_size), np.float32)
-    values, rewards = [], []
-    for _ in range(simulation.spec.episode_ticks):
-        seen = np.concatenate([observation['observation'], past], axis=1)
-        value, action = _judge(learner, seen, observation['desired_goal'])
-        past = past_after(past, action)
-        observation = simulation.step(action).observation
-        goals = observation['achieved_goal'], observation['desired_goal']
-        values.append(value)
-        rewards.append(compute_reward(*goals))
-    return np.array(values), np.array(rewards)
+def _play(trainer: Trainer) -> Episodes:
+    """Run an episode without noise in each simulation; return those that did not diverge."""
+    simulation = trainer.simulation
+    seeds = [FIRST_SEED + index for index in range(simulation.num_envs)]
+    collector = Collector(simulation, seeds, trainer.config)
+    collector.exploration = 0.0
+    return collector.collect(trainer.learner.acting_policy())[0]
 
 
 @torch.no_grad()
-def _judge(
-    learner: ActorCritic, seen: NDArray[np.float64], goal: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], Array32]:
-    """Return the critic's values (episodes,) of the actor's actions, and these actions.
-
-    `seen` are observations with past actions, (episodes, input size). Actions are (episodes, action
-    size), without noise.
-    """
-    features = learner.actor.features(*(learner.tensor(each).float() for each in (seen, goal)))
-    action = learner.actor(features)
-    value = learner.critic(features, action)
-    if value.ndim > 1:
-        value = value.mean(dim=0)
-    return value.double().numpy(), action.numpy()
+def _values(learner: ActorCritic, episodes: Episodes, tick: int) -> NDArray[np.float64]:
+    """Return the critic's values (episodes,) of the actor's actions at a tick."""
+    seen = episodes.observation[:, tick], episodes.desired_goal
+    features = learner.actor.features(*(learner.tensor(each) for each in seen))
+    value = learner.critic(features, learner.actor(features))
+    return np.asarray((value if value.ndim == 1 else value.mean(dim=0)).double().numpy())
 
 
 def discounted(rewards: NDArray[np.float64], gamma: float) -> NDArray[np.float64]:
