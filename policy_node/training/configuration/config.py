@@ -469,8 +469,8 @@ NEEDS: tuple[tuple[str, str, Callable[[Any], bool]], ...] = (
     ),
     (
         'start_share',
-        'init_from, algorithm ddpg or ppo and no subgoal_every',
-        lambda c: bool(c.init_from) and c.algorithm != 'imitation' and not c.subgoal_every,
+        'init_from and algorithm ddpg',
+        lambda c: bool(c.init_from) and c.algorithm == 'ddpg',
     ),
     (
         'importance',
