@@ -134,8 +134,7 @@ def _require_field(name: str) -> None:
     if name in FIELDS:
         return
     meanings = dict(zip(FIELDS, FIELDS, strict=True)) | {'her': 'strategy'}
-    for field, options in _OTHER_NAMES.items():
-        meanings |= {option.removeprefix('--'): field for option in options}
+    meanings |= {option.removeprefix('--'): field for field, option in _SHORT.items()}
     near = did_you_mean(name, meanings) or f'; allowed: {", ".join(FIELDS)}'
     raise ValueError(f'{name[:80]!r} is no field of TrainConfig{near}')
 
