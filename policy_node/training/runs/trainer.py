@@ -121,7 +121,7 @@ class BaseTrainer:
         if 0 < config.success_target <= counters.best_success:
             return 'success_target', f'success target {config.success_target:g} reached'
         if counters.env_steps >= config.total_steps:
-            return 'total_steps', f'{config.total_steps:,} environment steps done'
+            return 'total_steps', f'{counters.env_steps:,} environment steps done'
         if 0 < config.time_limit <= counters.seconds:
             return 'time_limit', f'time limit of {config.time_limit:g} s reached'
         return None

@@ -106,10 +106,11 @@ def test_a_finished_run_is_not_trained_any_further_but_with_more_steps(tmp_path,
     run = tmp_path / 'run'
     assert main([*REACH, '--steps', '800', '--output', str(run)]) == 0
     before = (run / STATE).read_bytes()
-    assert main(['--resume', str(run)]) == 0
-    said = capsys.readouterr().out
-    assert '800 environment steps done before; give another total_steps' in said
-    assert (run / STATE).read_bytes() == before
+    for fewer in ([], ['--steps', '400']):
+        assert main(['--resume', str(run), *fewer]) == 0
+        said = capsys.readouterr().out
+        assert '800 environment steps done before; give another total_steps' in said
+        assert (run / STATE).read_bytes() == before
     assert main(['--resume', str(run), '--steps', '1200']) == 0
     rows = [(row['env_steps'], row['updates']) for row in read_progress(run / 'progress.csv')]
     assert rows == [(400, 4), (800, 8), (1200, 12)]
