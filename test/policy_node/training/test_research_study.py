@@ -370,7 +370,10 @@ def test_first_stages_of_another_machine_are_trained_again(tmp_path: Path) -> No
         ),
         (Arm('a', 'short', {'time_limit': 1.0}), 'FetchReach/a has time_limit; jobs end when'),
         (Arm('a', 'circular', after='a'), 'FetchReach/a starts from its own networks'),
-        (Arm('a', 'misspelt', factors={'gama': 2}), "gama; did you mean 'gamma'"),
+        (
+            Arm('a', 'misspelt', factors={'gama': 2}),
+            "'gama' is no field of TrainConfig; did you mean 'gamma'",
+        ),
     ],
 )
 def test_a_study_that_cannot_finish_is_refused_before_it_trains(
