@@ -155,8 +155,14 @@ class RobotWatch:
             self._node.destroy_subscription(self._subscriptions.pop())
         self._end_change()
         self._change = self._node.create_timer(
-            _CHANGE_TIME, lambda: self._subscribe_to(spec), clock=self._clock
+            _CHANGE_TIME, lambda: self._finish_change(spec), clock=self._clock
         )
+
+    def _finish_change(self, spec: TaskSpec) -> None:
+        # On a busy machine a timer runs once more after it was destroyed.
+        if self._change is not None:
+            self._end_change()
+            self._subscribe_to(spec)
 
     def _end_change(self) -> None:
         if self._change is not None:
@@ -164,7 +170,6 @@ class RobotWatch:
             self._change = None
 
     def _subscribe_to(self, spec: TaskSpec) -> None:
-        self._end_change()
         names = [*_STATE, *(['object_pose'] if spec.has_object else [])]
         self._codecs = {name: TopicCodec(topic(spec, name)) for name in names}
         self._assembly = TickAssembly(names)

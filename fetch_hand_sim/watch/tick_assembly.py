@@ -34,12 +34,9 @@ class TickAssembly:
         ended: list[tuple[int, Values]] = []
         if name in _WITHOUT_STAMP:
             stamp_ns = next(reversed(self._begun), stamp_ns)
-        elif name in self._begun.get(stamp_ns, ()):
-            # The robot repeats the tick.
-            ended += self._end(stamp_ns)
-        elif stamp_ns not in self._begun and len(self._begun) > 1:
-            ended += self._end(next(iter(self._begun)))
-        if name not in _WITHOUT_STAMP and stamp_ns not in self._begun:
+        elif stamp_ns not in self._begun:
+            if len(self._begun) > 1:
+                ended += self._end(next(iter(self._begun)))
             self._begun[stamp_ns], self._early = self._early, {}
         tick = self._begun.get(stamp_ns, self._early)
         tick[name] = values
