@@ -12,7 +12,7 @@ from rclpy.clock_type import ClockType
 from rclpy.node import Node
 
 from fetch_hand_sim.simulation.scene import Frame
-from fetch_hand_sim.watch.tick_assembly import NEEDED, TickAssembly, Values
+from fetch_hand_sim.watch.tick_assembly import NEEDED, WITHOUT_STAMP, TickAssembly, Values
 from msgs_spec.arrays import Array
 from msgs_spec.codecs import TopicCodec, decode_status
 from msgs_spec.schemas import deserialize
@@ -26,8 +26,6 @@ WATCHING = QosSpec(depth=5, reliability='best_effort', durability='volatile')
 # QoS for every tick: two seconds at 25 Hz. A busy machine loses best-effort messages.
 _FOLLOWING = replace(WATCHING, depth=50, reliability='reliable')
 ANY_TASK = next(iter(TASKS.values()))
-# Topics of a tick. A reset has no reward and no command.
-_STATE = (*NEEDED, 'is_success', 'reward', 'applied_command')
 # Seconds between the end of a robot's subscriptions and those to another robot. The executor
 # removes the old ones after the callback; until then a topic cannot have another type.
 _CHANGE_TIME = 0.2
@@ -170,7 +168,7 @@ class RobotWatch:
             self._change = None
 
     def _subscribe_to(self, spec: TaskSpec) -> None:
-        names = [*_STATE, *(['object_pose'] if spec.has_object else [])]
+        names = NEEDED | WITHOUT_STAMP | ({'object_pose'} if spec.has_object else set())
         self._codecs = {name: TopicCodec(topic(spec, name)) for name in names}
         self._assembly = TickAssembly(names)
         self._takes_latest = self._has_latest()

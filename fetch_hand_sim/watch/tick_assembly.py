@@ -10,7 +10,8 @@ from msgs_spec.arrays import Array
 Values = dict[str, Array]
 # A tick without one of these cannot be shown.
 NEEDED = frozenset({'joint_states', 'desired_goal', 'achieved_goal'})
-_WITHOUT_STAMP = frozenset({'is_success', 'reward', 'applied_command'})
+# Messages of a tick without a stamp. A reset has no reward and no command.
+WITHOUT_STAMP = frozenset({'is_success', 'reward', 'applied_command'})
 
 
 class TickAssembly:
@@ -32,7 +33,7 @@ class TickAssembly:
     def add(self, name: str, stamp_ns: int, values: Array) -> list[tuple[int, Values]]:
         """Add a message; return stamp and values of the ticks that have ended and can be shown."""
         ended: list[tuple[int, Values]] = []
-        if name in _WITHOUT_STAMP:
+        if name in WITHOUT_STAMP:
             stamp_ns = next(reversed(self._begun), stamp_ns)
         elif stamp_ns not in self._begun:
             if len(self._begun) > 1:
