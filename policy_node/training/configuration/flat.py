@@ -133,7 +133,7 @@ def _require_field(name: str) -> None:
     """Raise ValueError if `TrainConfig` has no field `name`; suggest the field of an option."""
     if name in FIELDS:
         return
-    meanings = dict(zip(FIELDS, FIELDS, strict=True)) | {'her': 'strategy'}
+    meanings = {name: name for name in FIELDS} | {'her': 'strategy'}
     meanings |= {option.removeprefix('--'): field for field, option in _SHORT.items()}
     near = did_you_mean(name, meanings) or f'; allowed: {", ".join(FIELDS)}'
     raise ValueError(f'{name[:80]!r} is no field of TrainConfig{near}')
