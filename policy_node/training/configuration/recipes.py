@@ -238,7 +238,7 @@ _TURNING: dict[str, dict[str, Any]] = {
     'HandManipulateBlockRotateParallel': {'total_steps': 2_000_000, 'policy_delay': 2},
     'HandManipulateBlockRotateXYZ': {'total_steps': 4_800_000, 'policy_delay': 2},
     'HandManipulateEggRotate': {'total_steps': 3_200_000},
-    'HandManipulateEggFull': {'total_steps': 3_600_000, 'policy_delay': 2},
+    'HandManipulateEggFull': {'total_steps': 2_400_000, 'policy_delay': 2},
 }
 _BEST: dict[str, dict[str, Any]] = {
     'FetchReach': _REACH,
