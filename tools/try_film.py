@@ -20,13 +20,13 @@ def main() -> int:
     )
     with tempfile.TemporaryDirectory() as folder:
         envs = gymnasium.wrappers.vector.RecordVideo(
-            envs, folder, episode_trigger=lambda episode: True
+            envs, f'{folder}/films', episode_trigger=lambda episode: True
         )
         envs.reset(seed=0)
         for _ in range(5):
             envs.step(envs.action_space.sample())
         envs.close()
-        sizes = {path.name: path.stat().st_size for path in Path(folder).glob('*.mp4')}
+        sizes = {path.name: path.stat().st_size for path in Path(folder).glob('films/*.mp4')}
     print(f'films of RecordVideo, in bytes: {sizes}')
     return 0 if any(sizes.values()) else 1
 
