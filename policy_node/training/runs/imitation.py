@@ -25,7 +25,7 @@ from policy_node.training.evaluation import EpisodeOutcomes, training_seeds
 from policy_node.training.learners.actor_critic import network_shape, set_learning_rate
 from policy_node.training.learners.ddpg import Critic
 from policy_node.training.runs.initial_networks import InitialNetworks
-from policy_node.training.runs.run_folder import LATEST_FILE, RunFolder
+from policy_node.training.runs.run_folder import LATEST_FILE, RunFolder, disk_warning
 from policy_node.training.runs.run_log import RunLog, loss_columns
 from policy_node.training.runs.trainer import BaseTrainer
 from policy_node.training.runs.training_state import RunClock, part_of
@@ -128,8 +128,11 @@ class ImitationTrainer(BaseTrainer):
             reason = self._reason_to_stop()
             outcomes = self._evaluate(is_last=bool(reason))
             reason = reason or self._reason_to_stop()
-            if outcomes is not None or reason:
+            if reason:
                 self.folder.save_actor(LATEST_FILE, self.actor, counters.env_steps)
+            elif outcomes is not None:
+                with disk_warning('no checkpoint, the one before is kept'):
+                    self.folder.save_actor(LATEST_FILE, self.actor, counters.env_steps)
             samples = config.updates_per_cycle * config.batch_size
             seconds = max(time.monotonic() - before, 1e-9)
             row = self._row(success, outcomes, samples, seconds)

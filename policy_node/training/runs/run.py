@@ -38,6 +38,7 @@ from policy_node.training.runs.run_folder import (
     PROGRESS_FILE,
     STATE_FILE,
     RunFolder,
+    disk_warning,
     set_former_run_aside,
 )
 from policy_node.training.runs.run_log import Row, RunLog, draw_curve, read_progress
@@ -251,10 +252,8 @@ def _train(trainer: AnyTrainer, caller: Caller | None, *, resume: bool) -> Endin
             log.close()
     if log is not None:
         title = f'{config.task}, {config.recipe} recipe, seed {config.seed}'
-        try:
+        with disk_warning('no curve, the run itself is saved'):
             draw_curve(read_progress(output / PROGRESS_FILE), title, output / CURVE_FILE)
-        except OSError as error:
-            complain(NAME, f'no curve, the run itself is saved: {error}')
     return Ending(reason, trainer.counters, received[0] if received else 0)
 
 

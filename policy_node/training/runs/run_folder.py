@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import itertools
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -67,6 +69,17 @@ def set_former_run_aside(folder: Path) -> str:
     return f'files of an earlier run in {folder} are now in {target}'
 
 
+@contextmanager
+def disk_warning(lost: str) -> Iterator[None]:
+    """Only warn if a file cannot be written in the block; `lost` names the consequence."""
+    try:
+        yield
+    except OSError as error:
+        # stderr may be a file on the same full disk.
+        with suppress(OSError):
+            complain(NAME, f'{lost}: {error}')
+
+
 @dataclass(slots=True)
 class RunFolder:
     """Writes the actors, the training state and the replay of a run on one worker.
@@ -95,7 +108,8 @@ class RunFolder:
         """Save an evaluated actor if its success rate is the highest of the run so far.
 
         At equal success rates, the mean return decides. `counters` gets both values of the new best
-        actor. Evaluations of fewer than `evaluation_episodes` episodes have no effect.
+        actor. Evaluations of fewer than `evaluation_episodes` episodes have no effect, nor have
+        actors that cannot be written.
         """
         rule = self.config.success_rule
         success = success_rate(outcomes, rule)
@@ -103,11 +117,12 @@ class RunFolder:
         is_better = (success, mean_return) > (counters.best_success, counters.best_return)
         if not is_better or len(outcomes) < self.config.evaluation_episodes:
             return
-        counters.best_success, counters.best_return = success, mean_return
-        if self.workers.is_first:
-            measured = {'last_step': success, 'episodes': len(outcomes), 'rule': rule}
-            measured |= {'mean_return': mean_return, **diagnose(outcomes)}
-            self.save_actor(BEST_FILE, actor, counters.env_steps, measured)
+        with disk_warning('the best actor is not written, the one before is kept'):
+            if self.workers.is_first:
+                measured = {'last_step': success, 'episodes': len(outcomes), 'rule': rule}
+                measured |= {'mean_return': mean_return, **diagnose(outcomes)}
+                self.save_actor(BEST_FILE, actor, counters.env_steps, measured)
+            counters.best_success, counters.best_return = success, mean_return
 
     def read_best(self, counters: Counters) -> None:
         """Set the best success and return of a resumed run, in `counters`, from its best actor.
@@ -145,11 +160,9 @@ class RunFolder:
         now = time.monotonic()
         if now - self._last_checkpoint < self.config.checkpoint_seconds:
             return
-        try:
+        with disk_warning('no checkpoint, the one before is kept'):
             due = now - self._last_replay >= REPLAY_SECONDS
             self.save(learner, experience, counters, with_replay=due)
-        except OSError as error:
-            complain(NAME, f'no checkpoint, the one before is kept: {error}')
 
     def save(
         self,

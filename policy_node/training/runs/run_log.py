@@ -20,7 +20,7 @@ from rich.text import Text
 from node_runtime.signals import discard_unread_output
 from policy_node.training.evaluation import EpisodeOutcomes, diagnose, success_rate
 from policy_node.training.learners.actor_critic import Losses
-from policy_node.training.runs.run_folder import BOARD_FOLDER, PROGRESS_FILE
+from policy_node.training.runs.run_folder import BOARD_FOLDER, PROGRESS_FILE, disk_warning
 
 COLUMNS = (
     'seconds',
@@ -98,17 +98,15 @@ class RunLog:
             self._live.start()
 
     def write(self, row: Row) -> None:
-        """Write the row of one cycle; a value of None leaves its column empty.
-
-        Raises:
-            OSError: If the row cannot be written.
-        """
-        self._writer.writerow({name: _short(row.get(name)) for name in COLUMNS})
-        self._file.flush()
-        if self._board is not None:
-            self._board.write(row)
+        """Write the row of one cycle; a value of None leaves its column empty."""
+        with disk_warning(f'{self.path} lacks a row'):
+            self._writer.writerow({name: _short(row.get(name)) for name in COLUMNS})
+            self._file.flush()
+            if self._board is not None:
+                self._board.write(row)
         if not self._quiet:
-            self._show(row)
+            with disk_warning('no progress line'):
+                self._show(row)
         if self._on_row is not None:
             self._on_row(row)
 
@@ -117,9 +115,10 @@ class RunLog:
         discard_unread_output()
         if self._live.is_started:
             self._live.stop()
-        self._file.close()
-        if self._board is not None:
-            self._board.close()
+        with disk_warning(f'{self.path} lacks rows'):
+            self._file.close()
+            if self._board is not None:
+                self._board.close()
 
     def _show(self, row: Row) -> None:
         if row.get('eval_success') is not None:

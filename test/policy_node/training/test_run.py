@@ -268,18 +268,24 @@ def test_an_output_that_cannot_be_a_folder_is_one_line(output, tmp_path, capsys)
     assert 'cannot hold a run: ' in error and error[:-1].isprintable()
 
 
-def test_a_full_disk_leaves_no_partial_file_and_the_checkpoint_before(tmp_path, capsys):
+@pytest.mark.parametrize('size', [500, 30_000])
+def test_a_full_disk_leaves_no_partial_file_and_does_not_end_a_run(tmp_path, capsys, size):
     trainer = trainer_of(tmp_path, total_steps=2_000, checkpoint_seconds=0, evaluate_every=1_000)
     trainer.save()
-    before = (tmp_path / STATE).read_bytes()
-    for size in (1_000, 30_000):
-        with files_at_most(size), pytest.raises(OSError):
-            trainer.train()
-        assert 'no checkpoint, the one before is kept: ' in capsys.readouterr().err
-        assert not [path for path in os.listdir(tmp_path) if path.endswith('.partial')]
-        assert (tmp_path / STATE).read_bytes() == before
+    before, log = (tmp_path / STATE).read_bytes(), RunLog(tmp_path, 2_000, 0)
+    with files_at_most(size), pytest.raises(OSError):
+        trainer.train(log)
+    said = capsys.readouterr().err
+    assert 'no checkpoint, the one before is kept: ' in said
+    assert not [path for path in os.listdir(tmp_path) if path.endswith('.partial')]
+    assert (tmp_path / STATE).read_bytes() == before
+    log.close()
     trainer.save()
     assert counters_of(tmp_path)['updates'] == 20
+    if size == 500:
+        assert 'progress.csv lacks a row: ' in said and 'the best actor is not written, ' in said
+        assert not (tmp_path / 'best.safetensors').exists()
+        assert counters_of(tmp_path)['best_success'] == -1
 
 
 def row(steps, success):
