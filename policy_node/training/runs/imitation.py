@@ -51,9 +51,12 @@ class Answers:
             stored[rows] = values
         self._count += len(rows)
 
+    def __len__(self) -> int:
+        return min(self._count, self._capacity)
+
     def draw(self, count: int) -> list[Tensor]:
         """Draw `count` rows with replacement; return one tensor (count, size) for each part."""
-        rows = torch.randint(min(self._count, self._capacity), (count,))
+        rows = torch.randint(len(self), (count,))
         return [part[rows] for part in self._parts]
 
 
@@ -185,9 +188,14 @@ class ImitationTrainer(BaseTrainer):
         seen = np.concatenate([observation, past], axis=-1)
         return self.actor.features(torch.tensor(seen, dtype=torch.float32), goal)
 
-    def _learn(self) -> float:
-        """Fit the actor to stored labels, the imitated actions; return the mean loss of a cycle."""
+    def _learn(self) -> float | None:
+        """Fit the actor to stored labels, the imitated actions; return the mean loss of a cycle.
+
+        Return None without labels, because all simulations have diverged so far.
+        """
         config, total = self.config, 0.0
+        if not self._answers:
+            return None
         set_learning_rate(self._optimizer, config, self._progress())
         for _ in range(config.updates_per_cycle):
             inputs, answers, *states = self._answers.draw(config.batch_size)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import shutil
 
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+from fetch_hand_sim.simulation import Simulation
 from msgs_spec.tasks import TASKS
 from policy_node.policies import checkpoint
 from policy_node.policies.files import read_tensors, write_tensors
@@ -386,6 +388,18 @@ def test_the_critic_of_the_imitated_policy_judges_the_actions(tmp_path):
     before = trainer.actor(states).detach()
     trainer._learn()
     assert not torch.equal(before, trainer.actor(states))
+
+
+def test_a_cycle_in_which_all_simulations_diverge_is_not_learnt_from(tmp_path, monkeypatch):
+    step = Simulation.step
+
+    def diverge(simulation, actions):
+        return dataclasses.replace(step(simulation, actions), diverged=np.ones(2, np.bool_))
+
+    monkeypatch.setattr(Simulation, 'step', diverge)
+    trainer = trainer_of(recipe_config('FetchReach', 'robust', num_envs=2), tmp_path)
+    trainer._collect()
+    assert trainer._learn() is None and trainer.counters.updates == 0
 
 
 def test_the_newest_answers_are_kept():
