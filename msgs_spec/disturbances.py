@@ -55,8 +55,8 @@ class Kind:
         )
         if not is_right or given[0] > given[-1]:
             raise ValueError(
-                f'{name}={one_line(value, 40)}; allowed: a {"whole " if self.is_whole else ""}'
-                f'number {self.lowest:g} ... {self.highest:g}'
+                f'{name}={one_line(repr(value), 40)}; allowed: a '
+                f'{"whole " if self.is_whole else ""}number {self.lowest:g} ... {self.highest:g}'
                 f'{", or [lowest, highest]" if self.is_range else ""}'
             )
         numbers = [int(each) if self.is_whole else float(each) for each in given]

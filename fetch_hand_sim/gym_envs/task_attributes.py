@@ -201,9 +201,8 @@ class TaskAttributes:
 
     def _set_threshold(self, name: str, value: float) -> None:
         if not (isinstance(value, Real) and 0.0 <= value < _LARGEST_THRESHOLD):
-            raise ValueError(
-                f'{name} must be 0 ... {_LARGEST_THRESHOLD:g}, not {one_line(value, 40)}'
-            )
+            shown = one_line(repr(value), 40)
+            raise ValueError(f'{name} {shown}; allowed: 0 ... {_LARGEST_THRESHOLD:g}')
         metric = self.simulation.metric
         changed: dict[str, Any] = {name: float(value)}
         self.simulation.metric = metric.with_changes(spec=replace(metric.spec, **changed))

@@ -41,7 +41,7 @@ def finite_numbers(name: str, values: ArrayLike, shape: tuple[int, ...]) -> NDAr
         array = np.array(None)
     is_number = array.dtype.kind in 'iuf'
     if array.shape != shape or not is_number:
-        given = f'shape {array.shape}' if is_number else one_line(values, 40)
+        given = f'shape {array.shape}' if is_number else one_line(repr(values), 40)
         raise ValueError(f'{name}: {given} given; allowed: numbers of shape {shape}')
     if array.dtype not in (np.float32, np.float64):
         array = array.astype(np.float64)
@@ -96,8 +96,8 @@ def selected_simulations(ids: ArrayLike, num_envs: int) -> NDArray[np.intp]:
         or (np.unique(selected).size != selected.size)
     ):
         raise ValueError(
-            f'ids {one_line(ids, 40)}; allowed: distinct indices below {num_envs} or a boolean '
-            f'mask of shape ({num_envs},)'
+            f'ids {one_line(repr(ids), 40)}; allowed: distinct indices below {num_envs} or a '
+            f'boolean mask of shape ({num_envs},)'
         )
     return selected.astype(np.intp)
 

@@ -300,7 +300,7 @@ def test_arguments_of_gymnasium_are_those_of_its_vectorisation():
     env = make_vec('FetchReach', 2, max_episode_steps=-1, disable_env_checker=True)
     env.reset(seed=0)
     assert not any(env.step(np.zeros((2, 4)))[3].any() for _ in range(55))
-    with pytest.raises(ValueError, match=r'distance_threshold must be 0 ... 1e\+06, not'):
+    with pytest.raises(ValueError, match=r'distance_threshold array\('):
         env.unwrapped.set_attr('distance_threshold', np.array([0.1, 0.1]))
     assert fetch_hand_sim.make_vec('FetchReach', vectorization_mode='vector_entry_point')
     with pytest.raises(ValueError, match="mode 'sync' is for gymnasium"):

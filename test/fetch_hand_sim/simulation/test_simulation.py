@@ -215,7 +215,7 @@ BAD_CALLS = [
     (push(index=-1), 'index -1; allowed: whole numbers 0 ... 1'),
     (push(index=True), 'index True; '),
     (push(None), "no body 'None' that"),
-    (push(wrench='abcdef'), 'wrench: abcdef given'),
+    (push(wrench='abcdef'), "wrench: 'abcdef' given"),
     (lambda one: one.write_data(-1, one.data(0)), 'index -1; allowed'),
     (lambda one: one.generator(2), 'index 2; allowed'),
     (lambda one: one.variation('a'), "index 'a'; allowed"),
