@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Mapping
 from dataclasses import replace
+from inspect import signature
 from itertools import compress
 from numbers import Real
 from typing import Any, Self
@@ -83,6 +84,9 @@ class TaskAttributes:
             one_of(render_mode, self.metadata['render_modes'], 'render_mode')
         if 'num_envs' in self._batch.keys() & batch.keys():
             raise TypeError('num_envs is for fetch_hand_sim.make_vec; make returns one environment')
+        own, others = (signature(each).parameters for each in (TaskAttributes, Simulation))
+        for name in batch:
+            one_of(name, [each for each in {**own, **others} if each != 'batch'], 'no argument')
         self.simulation = Simulation(
             task,
             reward_type=reward_type,

@@ -142,6 +142,10 @@ def test_importing_the_package_registers_without_mujoco():
         ),
         ({'distance_threshold': 'a'}, r"distance_threshold 'a'; allowed: 0 ... 1e\+06"),
         ({'control_hz': '25'}, "control_hz '25' given"),
+        (
+            {'rewardtype': 'dense'},
+            "no argument 'rewardtype'; allowed: task, .*, timing; did you mean 'reward_type'",
+        ),
         ({'default_camera_config': 5}, "default_camera_config: '5' given; allowed: a mapping"),
         ({'disturbances': 'x' * 1000}, 'is neither a file nor a preset'),
         ({'default_camera_config': {'zoom': 2}}, "has no 'zoom'; allowed: azimuth,"),
