@@ -393,7 +393,7 @@ def test_two_workers_agree():
         (f'{PPO} --task FetchReach --from-episodes .', 'ppo excludes --from-episodes'),
         ('--task FetchReach --past-actions 2 --from-episodes .', 'past_actions excludes --'),
         ('--recipe robust --task FetchReach --from-episodes .', 'imitation excludes --from-epis'),
-        ('--resume nowhere', 'nowhere has no training_state.safetensors'),
+        ('--resume nowhere', 'nowhere/training_state.safetensors does not exist: the folder '),
     ],
 )
 def test_bad_usage_is_one_line_and_exit_status_2(arguments, message, capsys, tmp_path):
