@@ -23,7 +23,7 @@ from fetch_hand_sim.commands.node_processes import (
 from fetch_hand_sim.episode_log import EpisodeOutcome, EpisodeRecord, read_summary
 from msgs_spec.codecs import decode_status
 from msgs_spec.parameters import LARGEST_SEED, episode_seed
-from msgs_spec.tasks import TaskSpec, task_spec
+from msgs_spec.tasks import TASKS, TaskSpec, task_spec
 from msgs_spec.tick import EpisodeStatus
 from msgs_spec.topics import DIAGNOSTICS, topic, topics
 from node_runtime.command_line import (
@@ -239,7 +239,7 @@ def _require_to_be_alone(watcher: Watcher, stop: StopSignals) -> None:
 def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = CommandParser(prog=_NAME, description=__doc__)
     add, count, seed = parser.add_argument, whole_number(1), whole_number(0, LARGEST_SEED)
-    add('--task', default='FetchReach', help='default: %(default)s')
+    add('--task', help='default: that of --policy if it is the name of a task, or else FetchReach')
     add('--episodes', type=count, default=5, help='number of episodes; default: %(default)s')
     add('--seed', type=seed, default=0, help='seed of the first episode; default: %(default)s')
     add(
@@ -256,6 +256,8 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     )
     add('--trust', action='store_true', help='allow policies that run code of their own')
     options = parser.parse_args(arguments)
+    if options.task is None:
+        options.task = options.policy if options.policy in TASKS else 'FetchReach'
     try:
         task_spec(options.task)
     except ValueError as error:

@@ -9,6 +9,7 @@ import time
 
 import pytest
 
+from fetch_hand_sim.commands import demo as command
 from fetch_hand_sim.commands.node_processes import start_node, stop_node
 from fetch_hand_sim.episode_log import read_summary
 from msgs_spec.tasks import task_spec
@@ -89,6 +90,19 @@ def test_the_demo_is_not_begun_beside_others(node, who, start_process, tmp_path)
         f'fetch_hand_sim demo: {who} is running in / and would interact with this demo: stop it, '
         'or set another ROS_DOMAIN_ID\n'
     )
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'task'),
+    [
+        ([], 'FetchReach'),
+        (['--policy', 'random'], 'FetchReach'),
+        (['--policy', 'HandReach'], 'HandReach'),
+        (['--policy', 'HandReach', '--task', 'FetchPush'], 'FetchPush'),
+    ],
+)
+def test_the_task_follows_the_policy_unless_it_is_given(arguments, task):
+    assert command._parse(arguments).task == task
 
 
 def test_a_node_that_is_still_loaded_ends_quietly():
