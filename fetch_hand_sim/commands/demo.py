@@ -145,7 +145,11 @@ class Demo:
         """
         began = time.monotonic()
         with open_log('demo') as output:
-            policy_parameters = {'policy': policy, 'trust': self._options.trust}
+            policy_parameters = {
+                'task': self._spec.name,
+                'policy': policy,
+                'trust': self._options.trust,
+            }
             nodes = start_nodes(
                 {'policy_node': policy_parameters, 'sim_node': self._sim_parameters()}, output
             )

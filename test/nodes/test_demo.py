@@ -92,6 +92,15 @@ def test_the_demo_is_not_begun_beside_others(node, who, start_process, tmp_path)
     )
 
 
+def test_a_policy_that_cannot_be_loaded_is_wrong_usage_as_in_other_commands(
+    start_process, tmp_path
+):
+    (tmp_path / 'mine.py').write_text('def make(task): return lambda observation: 1 / 0')
+    demo = start_process(*DEMO, '--policy=mine:make', '--trust', '--episodes=1', cwd=tmp_path)
+    code, output = finish(demo)
+    assert code == 2 and 'policy_node: mine:make fails: ZeroDivisionError' in output
+
+
 @pytest.mark.parametrize(
     ('arguments', 'task'),
     [
