@@ -54,6 +54,12 @@ def first_of(names: Sequence[str], most: int) -> str:
     return f'{", ".join(names[:most])}{rest}'
 
 
+def counted(count: int, noun: str) -> str:
+    """Return a number with its noun, such as `1 success` or `2 successes`."""
+    plural = 'es' if noun.endswith('s') else 's'
+    return f'{count} {noun}{"" if count == 1 else plural}'
+
+
 def printable(text: str) -> str:
     """Return a text with unprintable characters, such as line breaks, as escape sequences."""
     return ''.join(c if c.isprintable() else ascii(c)[1:-1] for c in text)

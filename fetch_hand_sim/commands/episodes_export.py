@@ -21,6 +21,7 @@ from fetch_hand_sim.episode_log import (
 )
 from fetch_hand_sim.episode_log.arrays import arrays_of
 from fetch_hand_sim.episode_log.files import holds_no_episode
+from msgs_spec.text import counted
 from node_runtime.command_line import (
     EXIT_FAILURE,
     EXIT_SUCCESS,
@@ -109,7 +110,7 @@ def _counted(episodes: Sequence[EpisodeArrays]) -> str:
     """Return a text with the number of episodes and how many of them were interrupted."""
     interrupted = sum(not episode.is_complete for episode in episodes)
     told = f', {interrupted} of them interrupted,' if interrupted else ''
-    return f'{len(episodes)} episodes{told}'
+    return f'{counted(len(episodes), "episode")}{told}'
 
 
 def _add(path: Path, by_task: dict[str, list[EpisodeArrays]], options: argparse.Namespace) -> bool:

@@ -26,7 +26,7 @@ from fetch_hand_sim.episode_log import (
 )
 from fetch_hand_sim.episode_log.files import folders_below, metadata_file, read_each
 from fetch_hand_sim.episode_log.metadata import integer_or_none
-from msgs_spec.text import printable
+from msgs_spec.text import counted, printable
 from node_runtime.command_line import (
     EXIT_FAILURE,
     EXIT_SUCCESS,
@@ -132,7 +132,8 @@ def _run(options: argparse.Namespace) -> int:
         successes = sum(outcome.is_success is True for outcome in complete)
         interrupted, filtered = len(shown) - len(complete), len(episodes) - len(shown)
         note = f' ({interrupted} interrupted)' if interrupted else ''
-        print(f'{len(shown)} episodes{note}, {successes} successes; {filtered} filtered')
+        listed, won = counted(len(shown), 'episode'), counted(successes, 'success')
+        print(f'{listed}{note}, {won}; {filtered} filtered')
         if not (episodes or errors) and (below := folders_below(options.path)):
             print(f'episodes are in {below}')
     for leftover in leftovers:

@@ -15,6 +15,7 @@ from rich.text import Text
 from fetch_hand_sim.simulation import Simulation
 from fetch_hand_sim.simulation.tasks.hand_manipulate import PALM_HEIGHT
 from msgs_spec.tasks import GoalKind, TaskSpec
+from msgs_spec.text import counted
 from node_runtime.command_line import show_table
 from policy_node.policies.policy import Policy
 
@@ -273,7 +274,8 @@ def print_table(report: dict[str, Any]) -> None:
     key `disturbances` marks the robot as disturbed. The optional key `against` contains the result
     of `compare` and `policy`, the name of the other policy.
     """
-    title = f'{report["task"]}: {report["policy"]}, {report["episodes"]} episodes'
+    episodes = counted(report['episodes'], 'episode')
+    title = f'{report["task"]}: {report["policy"]}, {episodes}'
     if 'disturbances' in report:
         title += ', disturbed'
     table = Table('measure', 'value', '95 % interval', title=Text(title))

@@ -21,6 +21,7 @@ from fetch_hand_sim.episodes.generator import EpisodeGenerator
 from fetch_hand_sim.episodes.recorder import RecordingContext
 from fetch_hand_sim.simulation import Observation, Simulation
 from msgs_spec.parameters import LARGEST_SEED
+from msgs_spec.text import counted
 from node_runtime.command_line import (
     EXIT_SUCCESS,
     CommandError,
@@ -106,9 +107,9 @@ def _run(options: argparse.Namespace) -> int:
         wall, cpu = time.perf_counter() - began, time.process_time() - cpu_began
         simulated = steps * simulation.tick_duration
         say(
-            f'{count} episodes of {simulation.spec.name} in {options.output}: '
-            f'{successes} successes, {steps} steps, {wall:.1f} s, {simulated / wall:.0f} x real '
-            f'time, {simulated / cpu:.0f} x per core'
+            f'{counted(count, "episode")} of {simulation.spec.name} in {options.output}: '
+            f'{counted(successes, "success")}, {steps} steps, {wall:.1f} s, '
+            f'{simulated / wall:.0f} x real time, {simulated / cpu:.0f} x per core'
         )
     return EXIT_SUCCESS
 

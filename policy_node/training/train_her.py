@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from msgs_spec.tasks import TASKS, task_spec
+from msgs_spec.text import counted
 from node_runtime.command_line import (
     EXIT_SUCCESS,
     CommandError,
@@ -164,7 +165,7 @@ def _read_experience(config: TrainConfig, directory: Path | None) -> Episodes | 
             f'allow more with --set replay_transitions={transitions}'
         )
     left_out = f'; {len(skipped)} left out, first: {skipped[0]}' if skipped else ''
-    complain(_NAME, f'{len(episodes)} episodes from {directory}{left_out}')
+    complain(_NAME, f'{counted(len(episodes), "episode")} from {directory}{left_out}')
     return episodes
 
 

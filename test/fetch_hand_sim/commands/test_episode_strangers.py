@@ -73,7 +73,7 @@ def test_a_bad_entry_hides_no_good_one(directory, make, capsys):
     bad, good = find_leftovers(directory)
     assert bad.problem and not good.problem
     assert episodes_list.main([str(directory)]) == 0
-    assert '1 episodes' in capsys.readouterr().out
+    assert '1 episode, ' in capsys.readouterr().out
     assert episodes_recover.main([str(directory)]) == 1
     output = capsys.readouterr()
     assert 'recovered' in output.out
@@ -213,7 +213,7 @@ def test_an_export_has_the_episodes_that_a_list_has(finished, tmp_path, capsys):
     output = ['--to', 'parquet', '--output', str(tmp_path / 'data')]
     assert episodes_export.main([str(directory), *output]) == 1
     exported = capsys.readouterr()
-    assert '1 episodes' in listed.out and '1 episodes of FetchReach' in exported.out
+    assert '1 episode, ' in listed.out and '1 episode of FetchReach' in exported.out
     for text in (listed.err, exported.err):
         for part in ('dangling.mcap', f'cut/{NAME}_0.mcap', 'hollow', 'several holds 2 MCAP files'):
             assert sum(part in line for line in text.splitlines()) == 1

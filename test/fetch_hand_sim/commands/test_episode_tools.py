@@ -320,7 +320,7 @@ def test_list_takes_one_file_or_bag_like_the_other_commands(reach, tmp_path, cap
         assert episodes_list.main([str(path)]) == 0
         lines = capsys.readouterr().out.splitlines()
         assert lines[1].split()[0] == bag.name
-        assert lines[-1] == '1 episodes, 0 successes; 0 filtered'
+        assert lines[-1] == '1 episode, 0 successes; 0 filtered'
     # A bag of another storage is no empty folder of episodes.
     (tmp_path / 'metadata.yaml').touch()
     assert episodes_list.main([str(tmp_path)]) == 1
@@ -406,7 +406,7 @@ def test_list_filters(reach, tmp_path, capsys):
         table = capsys.readouterr().out.splitlines()[1:-1]
         assert [line.split()[0] for line in table] == expected, options
     assert episodes_list.main([str(directory)]) == 0
-    assert capsys.readouterr().out.endswith('7 episodes (3 interrupted), 1 successes; 0 filtered\n')
+    assert capsys.readouterr().out.endswith('7 episodes (3 interrupted), 1 success; 0 filtered\n')
 
 
 def test_list_shows_no_control_characters_and_no_long_values_of_a_file(tmp_path, capsys):

@@ -37,7 +37,7 @@ def test_an_old_episode_is_checked_and_listed(capsys):
     assert episodes_check.main([str(OLD)]) == 0
     assert 'identical, 51 ticks, 459 messages' in capsys.readouterr().out
     assert episodes_list.main([str(OLD)]) == 0
-    assert '1 episodes' in capsys.readouterr().out
+    assert '1 episode, ' in capsys.readouterr().out
 
 
 def test_cut_off_it_is_recovered(tmp_path):
