@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import os
+import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -15,6 +16,8 @@ from node_runtime.command_line import CommandError
 
 ByTask = Mapping[str, Sequence[EpisodeArrays]]
 
+# Exports write into a folder of such a name first.
+_HIDDEN = '.partial.'
 _SETTINGS = ('control_hz', 'timing', 'reward_type', 'success_rule')
 
 
@@ -39,13 +42,18 @@ def why_apart(episode: EpisodeArrays, first: EpisodeArrays) -> str:
 
 @contextmanager
 def alone_in(directory: Path) -> Iterator[None]:
-    """Lock a folder, created if missing, until the block ends; wait for another process's lock."""
+    """Lock a folder, created if missing, until the block ends; wait for another process's lock.
+
+    Remove the hidden folders of exports that were killed.
+    """
     directory.mkdir(parents=True, exist_ok=True)
     descriptor = os.open(directory, os.O_RDONLY | os.O_DIRECTORY)
     try:
         # Some file systems lack locks.
         with suppress(OSError):
             fcntl.flock(descriptor, fcntl.LOCK_EX)
+            for leftover in directory.glob(f'{_HIDDEN}*'):
+                shutil.rmtree(leftover)
         yield
     finally:
         os.close(descriptor)
@@ -64,7 +72,7 @@ def appearing(directory: Path, names: Iterable[str]) -> Iterator[Path]:
             for path in targets.values():
                 if path.exists():
                     raise ExportError(f'{path} exists; nothing is overwritten')
-            with TemporaryDirectory(prefix='.partial.', dir=directory) as hidden:
+            with TemporaryDirectory(prefix=_HIDDEN, dir=directory) as hidden:
                 yield Path(hidden)
                 for name, target in targets.items():
                     target.parent.mkdir(parents=True, exist_ok=True)

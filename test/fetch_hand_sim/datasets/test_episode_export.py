@@ -111,6 +111,7 @@ def test_a_full_disk_leaves_no_partial_file(episodes, export, tmp_path, format_,
     (line,) = capsys.readouterr().err.splitlines()
     assert 'File too large' in line
     assert list(tmp_path.iterdir()) == []
+    (tmp_path / '.partial.of_a_killed_export').mkdir()
     assert export(episodes, format_, tmp_path) == 0, capsys.readouterr()
     assert not [path for path in tmp_path.rglob('*') if path.name.startswith('.')]
 
