@@ -8,6 +8,7 @@ from typing import Any
 import gymnasium
 import mujoco
 import numpy as np
+from gymnasium.utils import seeding
 from numpy.typing import ArrayLike, NDArray
 
 from fetch_hand_sim.gym_envs.pictures import RENDER_MODES, Image
@@ -66,15 +67,18 @@ class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32
             The observation, and an empty dictionary.
 
         Raises:
-            ValueError: If an option is unknown or invalid.
+            ValueError: If an option is unknown or invalid; the environment stays as it was.
             gymnasium.error.Error: If the seed is no integer or negative.
         """
         given = self._read_options(options, np.ones(1, dtype=bool))
-        super().reset(seed=seed)
+        continued = self.np_random, self.np_random_seed
+        random, used = continued if seed is None else seeding.np_random(seed)
         self._physics.send()
         self.simulation.goals = self.simulation.goals.copy()
         draws_goals = self._draws_goals()
-        observation = _first(self.simulation.reset(seed=[self.np_random], **given))
+        observation = _first(self.simulation.reset(seed=[random], **given))
+        # As `gymnasium.Env.reset` does, but not before the simulation has accepted the options.
+        self._np_random, self._np_random_seed = random, used
         self._physics.receive()
         if not draws_goals and given['goal'][0] is None:
             self.goal = self._sample_goal()

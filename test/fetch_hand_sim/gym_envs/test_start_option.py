@@ -175,7 +175,8 @@ def test_other_arguments_are_rejected_likewise(numbers, arguments, line):
 
 def state_of(env) -> bytes:
     simulation = env.unwrapped.simulation
-    return simulation.task.batch.state.tobytes() + simulation.goals.tobytes()
+    state: bytes = simulation.task.batch.state.tobytes() + simulation.goals.tobytes()
+    return state + str(env.unwrapped.np_random_seed).encode()
 
 
 def assert_rejected(env, line, **arguments) -> None:
