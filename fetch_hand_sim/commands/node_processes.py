@@ -69,12 +69,16 @@ def open_log(name: str) -> IO[str]:
 
 
 def start_node(
-    name: str, parameters: Mapping[str, object], output: IO[str], namespace: str = ''
+    name: str,
+    parameters: Mapping[str, object],
+    output: IO[str],
+    namespace: str = '',
+    *arguments: str,
 ) -> subprocess.Popen[str]:
     """Start the executable `name` as a child process that terminates when this process does.
 
-    `parameters` are ROS parameters by name; `output` receives stdout and stderr. Ctrl-C in the
-    terminal does not reach the child process.
+    `parameters` are ROS parameters by name; `output` receives stdout and stderr; `arguments` are
+    further ROS arguments. Ctrl-C in the terminal does not reach the child process.
     """
     words = []
     for parameter, value in parameters.items():
@@ -83,7 +87,7 @@ def start_node(
     if namespace:
         words += ['-r', f'__ns:=/{namespace.strip("/")}']
     return subprocess.Popen(
-        [*executable(name, parent=os.getpid()), '--ros-args', *words],
+        [*executable(name, parent=os.getpid()), '--ros-args', *words, *arguments],
         stdout=output,
         stderr=subprocess.STDOUT,
         text=True,
@@ -92,7 +96,7 @@ def start_node(
 
 
 def start_nodes(
-    nodes: Mapping[str, Mapping[str, object]], output: IO[str], namespace: str = ''
+    nodes: Mapping[str, Mapping[str, object]], output: IO[str], namespace: str = '', *arguments: str
 ) -> list[subprocess.Popen[str]]:
     """Start several nodes and return their processes; if one cannot start, stop the others.
 
@@ -101,7 +105,7 @@ def start_nodes(
     started: list[subprocess.Popen[str]] = []
     try:
         for name, parameters in nodes.items():
-            started.append(start_node(name, parameters, output, namespace))
+            started.append(start_node(name, parameters, output, namespace, *arguments))
     except BaseException:
         for process in started:
             stop_node(process)

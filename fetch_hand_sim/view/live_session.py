@@ -173,7 +173,9 @@ def _start(options: argparse.Namespace, node: Node, log: IO[str]) -> Nodes:
         'policy_node': {'policy': policy, 'trust': options.trust},
         'sim_node': settings,
     }
-    return dict(zip(nodes, start_nodes(nodes, log, node.get_namespace()), strict=True))
+    # At level info, a line for each episode would fill the disk for days.
+    quiet = '--log-level', 'warn'
+    return dict(zip(nodes, start_nodes(nodes, log, node.get_namespace(), *quiet), strict=True))
 
 
 def check_alive(nodes: Nodes, log: IO[str]) -> None:

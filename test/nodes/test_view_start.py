@@ -30,6 +30,8 @@ def test_the_nodes_end_with_their_parent(
         with client(REACH) as connection:
             connection.subscribe('reward')
             connection.spin_until(lambda: connection.received['reward'], 'step')
+        # The nodes share a log file, to which each episode would add a line.
+        assert '[INFO]' not in Path(f'/proc/{nodes[0]}/fd/1').read_text()
     view.send_signal(number)
     code, output = finish(view)
     assert code == (-signal.SIGKILL if number == signal.SIGKILL else 0), output
