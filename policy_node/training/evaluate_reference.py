@@ -29,6 +29,7 @@ from policy_node.training.evaluation import wilson_interval
 from policy_node.training.policy_options import (
     add_first_seed,
     add_policy_options,
+    chosen_seeds,
     load_chosen_policy,
     policy_errors,
     write_result,
@@ -93,7 +94,7 @@ def _run(options: argparse.Namespace) -> int:
     spec = task_spec(loaded.task)
     if loaded.control_hz not in (None, DEFAULT_CONTROL_HZ):
         raise UsageError(f'{loaded.description} was trained at {loaded.control_hz:g} Hz, not at 25')
-    seeds = range(options.first_seed, options.first_seed + options.episodes)
+    seeds = chosen_seeds(options)
     if spec.reference_id is None:
         raise UsageError(f'{spec.name} is no task of Gymnasium-Robotics')
     report = _report_to_add_to(options.json)

@@ -78,6 +78,14 @@ def policy_errors() -> Iterator[None]:
         raise CommandError(str(error)) from None
 
 
+def chosen_seeds(options: argparse.Namespace) -> range:
+    """Return the seeds of `--first-seed` and `--episodes`; UsageError if the last is too large."""
+    seeds = range(options.first_seed, options.first_seed + options.episodes)
+    if seeds[-1] > LARGEST_SEED:
+        raise UsageError(f'the last seed would be {seeds[-1]}; allowed: 0 ... {LARGEST_SEED}')
+    return seeds
+
+
 def make_chosen_simulation(options: argparse.Namespace, loaded: LoadedPolicy) -> Simulation:
     """Return the simulations for a policy, with the options of `add_simulation_options`.
 
@@ -86,9 +94,7 @@ def make_chosen_simulation(options: argparse.Namespace, loaded: LoadedPolicy) ->
     Raises:
         UsageError: If an option does not fit the policy, or the last seed is too large.
     """
-    last = options.first_seed + options.episodes - 1
-    if last > LARGEST_SEED:
-        raise UsageError(f'the last seed would be {last}; allowed: 0 ... {LARGEST_SEED}')
+    chosen_seeds(options)
     with usage_errors():
         simulation = Simulation(
             loaded.task,

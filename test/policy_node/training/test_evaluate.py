@@ -255,16 +255,18 @@ def test_ctrl_c_reports_the_episodes_that_are_finished(capsys, monkeypatch):
     assert json.loads(capsys.readouterr().out)['episodes'] == 3
 
 
-def test_an_invalid_report_is_rejected_before_the_evaluation(tmp_path):
+def test_an_invalid_report_or_seed_is_rejected_before_the_evaluation(tmp_path):
     (tmp_path / 'list.json').write_text('[1]')
     (tmp_path / 'folder.json').mkdir()
     code = f"""
 from policy_node.training.evaluate_reference import main
 for name in ('list', 'folder'):
     print(main(['--policy', 'FetchReach', '--json', f'{tmp_path}/{{name}}.json']))
+print(main(['--policy', 'FetchReach', '--first-seed', '4294967295', '--episodes', '2']))
 """
     command = [sys.executable, '-O', '-c', code]
     found = subprocess.run(command, capture_output=True, text=True, check=True, timeout=120)
-    assert found.stdout == '2\n2\n'
-    listed, folder = found.stderr.splitlines()
+    assert found.stdout == '2\n2\n2\n'
+    listed, folder, seed = found.stderr.splitlines()
+    assert 'the last seed would be 4294967296; allowed: 0 ... 4294967295' in seed
     assert 'contains no JSON object' in listed and 'cannot be written: ' in folder
