@@ -315,9 +315,9 @@ class Machine:
     torch_threads: Count = 0
     """Threads of one tensor operation; 0 is 1 up to batches of 1024, then half of the cores."""
     precision: Literal['auto', 'float32', 'bfloat16'] = 'auto'
-    """Of the learner; `auto`: bfloat16 where the processor has it. `ppo` uses float32."""
+    """Of `ddpg`; others use float32. `auto`: bfloat16 where the processor has it."""
     device: Literal['auto', 'cpu', 'cuda'] = 'auto'
-    """Device of the networks."""
+    """Device of the networks; `imitation` uses the CPU."""
 
 
 @dataclass(frozen=True, kw_only=True)
