@@ -110,7 +110,8 @@ def _final_success(job: Job) -> float | None:
 def area_under(curve: Curve, total_steps: int) -> float:
     """Return the mean success from step 0 to `total_steps`, interpolated between evaluations.
 
-    Success rises linearly from 0 to the first evaluation and is constant after the last one.
+    Success rises linearly from 0 to the first evaluation and is constant after the last one. An
+    evaluation beyond `total_steps` has no effect.
     """
     inside = curve.env_steps <= total_steps
     return _mean_until(float(total_steps), curve.env_steps[inside], curve.success[inside])
