@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import MISSING, Field, dataclass, fields
 from io import BytesIO
 from typing import Any, Literal
 
@@ -36,9 +35,6 @@ PHASES: dict[Phase, str] = {
     'finished': 'at the last tick of an episode that no reset ended',
 }
 
-# Values with which a key is left out of the message.
-_LEFT_OUT = {'joint_prefix': JOINT_PREFIX, 'disturbances': '', 'variation': ''}
-
 _CHOICES: dict[str, tuple[str, ...]] = {
     'phase': tuple(PHASES),
     'reward_type': REWARD_TYPES,
@@ -57,7 +53,7 @@ _READERS: dict[str, Callable[[str], Any]] = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EpisodeStatus:
-    """Contents of the topic `episode_status`.
+    """Contents of the topic `episode_status`; the message leaves out fields with default values.
 
     Attributes:
         episode: Index of the episode since the node started, from 0.
@@ -65,9 +61,9 @@ class EpisodeStatus:
         phase: See `PHASES`.
         control_hz: Ticks per second of simulated time; observations depend on it.
         episode_return: Sum of rewards so far.
-        joint_prefix: Prefix of the joint names; left out of the message if it is the default.
-        disturbances: Disturbances as JSON; left out of the message if there are none.
-        variation: Values that disturbances drew for the episode, as JSON; left out if empty.
+        joint_prefix: Prefix of the joint names.
+        disturbances: Disturbances as JSON; empty if there are none.
+        variation: Values that disturbances drew for the episode, as JSON; empty if there are none.
     """
 
     task: str
@@ -93,8 +89,11 @@ class EpisodeStatus:
 
     def to_values(self) -> dict[str, str]:
         """Return the key/value pairs of the message `episode_status`."""
-        values = {key: str(value) for key, value in dataclasses.asdict(self).items()}
-        return {key: text for key, text in values.items() if _LEFT_OUT.get(key) != text}
+        return {
+            each.name: str(getattr(self, each.name))
+            for each in fields(self)
+            if getattr(self, each.name) != each.default
+        }
 
     @classmethod
     def from_values(cls, values: Mapping[str, str]) -> EpisodeStatus:
@@ -102,30 +101,28 @@ class EpisodeStatus:
 
         Unknown keys are ignored.
         """
-        values = {**_LEFT_OUT, **values}
-        missing = [f.name for f in dataclasses.fields(cls) if f.name not in values]
-        if missing:
+        required = [each.name for each in fields(cls) if each.default is MISSING]
+        if missing := [name for name in required if name not in values]:
             raise ValueError(f'episode_status without {", ".join(missing)}')
-        found: dict[str, Any] = {}
-        for each in dataclasses.fields(cls):
-            name, text = each.name, values[each.name]
-            if name in _CHOICES:
-                found[name] = one_of(text, _CHOICES[name], f'episode_status with {name}')
-                continue
-            try:
-                found[name] = _READERS[str(each.type)](text)
-            except (KeyError, ValueError):
-                raise ValueError(
-                    f'episode_status with unreadable value: {name}={text[:40]!r}'
-                ) from None
-        status = cls(**found)
         try:
+            given = [each for each in fields(cls) if each.name in values]
+            status = cls(**{each.name: _read(each, values[each.name]) for each in given})
             substeps_per_tick(status.control_hz)
+            if (length := len(status.joint_prefix)) > LONGEST_JOINT_PREFIX:
+                raise ValueError(f'joint_prefix of {length} characters')
         except ValueError as error:
             raise ValueError(f'episode_status with {error}') from None
-        if (length := len(status.joint_prefix)) > LONGEST_JOINT_PREFIX:
-            raise ValueError(f'episode_status with joint_prefix of {length} characters')
         return status
+
+
+def _read(field: Field[Any], text: str) -> Any:
+    """Return the value of a field of `EpisodeStatus`, or raise ValueError."""
+    if field.name in _CHOICES:
+        return one_of(text, _CHOICES[field.name], field.name)
+    try:
+        return _READERS[str(field.type)](text)
+    except (KeyError, ValueError):
+        raise ValueError(f'unreadable value: {field.name}={text[:40]!r}') from None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
