@@ -285,10 +285,6 @@ _STAMP = struct.Struct('<iI')
 _FLOAT = struct.Struct('<d')
 
 
-class LayoutError(ValueError):
-    """The bytes of a message are arranged differently from those that this project writes."""
-
-
 class TopicCodec:
     """Encodes and decodes the vectors of one topic, except those of type DiagnosticArray.
 
@@ -343,20 +339,20 @@ class TopicCodec:
     def decode_many(self, messages: NDArray[np.uint8]) -> tuple[NDArray[np.int64], Array]:
         """Decode n messages (n, size) at once; return stamps (n,) and vectors (n, topic.size).
 
-        Raise LayoutError if `encode` could not have returned one of the messages. In this case,
-        decode all messages one by one with `decode`.
+        Raise ValueError if `encode` could not have returned one of the messages; `decode` also
+        reads others.
         """
         if messages.ndim != 2 or messages.shape[1] != self.size:
-            raise LayoutError(f'{self.topic.name}: {messages.shape[-1]} bytes, not {self.size}')
+            raise ValueError(f'{self.topic.name}: {messages.shape[-1]} bytes, not {self.size}')
         template = np.frombuffer(self._template, np.uint8)
         if any((messages[:, run] != template[run]).any() for run, _ in self._fixed):
-            raise LayoutError(f'{self.topic.name}: not the layout of this project')
+            raise ValueError(f'{self.topic.name}: not the layout of this project')
         stamps = np.zeros(len(messages), dtype=np.int64)
         if self._has_stamp:
             parts = messages[:, _BODY : _BODY + _STAMP.size].copy()
             seconds, nanoseconds = parts.view('<i4')[:, 0], parts.view('<u4')[:, 1]
             if (nanoseconds >= _NANOSECONDS).any():
-                raise LayoutError(f'{self.topic.name}: a stamp has too many nanoseconds')
+                raise ValueError(f'{self.topic.name}: a stamp has too many nanoseconds')
             stamps = seconds.astype(np.int64) * _NANOSECONDS + nanoseconds
         if self._is_bool:
             return stamps, (messages[:, _BODY : _BODY + 1] != 0).astype(np.float64)
