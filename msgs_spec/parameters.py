@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from msgs_spec.disturbances import read_disturbances
-from msgs_spec.robots import LONGEST_JOINT_PREFIX, MODEL_PREFIX
+from msgs_spec.robots import LONGEST_JOINT_PREFIX, MODEL_PREFIX, check_joint_prefix
 from msgs_spec.tasks import (
     DEFAULT_CONTROL_HZ,
     REWARD_TYPES,
@@ -30,10 +30,9 @@ class ParameterSpec:
 
     Attributes:
         choices: Allowed strings; if empty, any string is allowed.
-        longest: Maximum number of characters; None for no limit.
         or_zero: Whether 0 is allowed, too, although it is less than `lower`.
         read_only: Whether the value cannot change while the node runs.
-        check: Raises ValueError for an invalid value; None as its result also rejects a string.
+        check: Raises ValueError for an invalid value of the right type and range.
         former: Former name of the parameter, which is accepted with a warning.
         is_path: Whether the node replaces `~` by the home directory, because no shell does this in
             `<name>:=<value>`.
@@ -44,7 +43,6 @@ class ParameterSpec:
     default: Value
     description: str
     choices: tuple[str, ...] = ()
-    longest: int | None = None
     lower: float = -math.inf
     upper: float = math.inf
     or_zero: bool = False
@@ -61,7 +59,7 @@ class ParameterSpec:
         if self.type == 'bool':
             return 'true, false'
         if self.type == 'string':
-            return 'text' if self.longest is None else f'text of up to {self.longest} characters'
+            return 'text'
         limits = f'{self.lower:.10g} ... {self.upper:.10g}'
         kind = 'whole numbers ' if self.type == 'integer' else ''
         return f'0 or {limits}' if self.or_zero else f'{kind}{limits}'
@@ -69,8 +67,6 @@ class ParameterSpec:
 
 LARGEST_SEED = 2**32 - 1
 
-# ms. A robot that waits longer is in lockstep.
-LONGEST_ANSWER_WAIT = 1000.0
 # N. Larger forces throw the robots apart.
 LARGEST_PERTURBATION = 100.0
 # Pixels.
@@ -162,16 +158,18 @@ SIM_NODE = (
         0.0,
         'Milliseconds that a tick in mode realtime waits at most for the command that answers the '
         'last observation; 0 never waits.',
+        # A robot that waits longer is in lockstep.
         lower=0.0,
-        upper=LONGEST_ANSWER_WAIT,
+        upper=1000.0,
         read_only=False,
     ),
     ParameterSpec(
         'joint_prefix',
         'string',
         MODEL_PREFIX,
-        'Prefix of the joint names, such as left_; model keeps the names of the model, robot0:.',
-        longest=LONGEST_JOINT_PREFIX,
+        f'Prefix of the joint names, such as left_, up to {LONGEST_JOINT_PREFIX} characters; model '
+        'keeps the names of the model, robot0:.',
+        check=check_joint_prefix,
     ),
     ParameterSpec(
         'wait_for_commands',
@@ -296,23 +294,18 @@ def validate(spec: ParameterSpec, value: object) -> None:
         is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
         kind = 'a number, ' if spec.type == 'double' and not is_number else ''
         raise ValueError(f'{spec.name}: {value!r:.80} given; allowed: {kind}{spec.allowed}{hint}')
+    if spec.check is not None:
+        spec.check(value)
 
 
 def _is_allowed(spec: ParameterSpec, value: object) -> bool:
     if spec.type == 'bool':
         return isinstance(value, bool)
     if spec.type == 'string':
-        return (
-            isinstance(value, str)
-            and (not spec.choices or value in spec.choices)
-            and (spec.longest is None or len(value) <= spec.longest)
-            and (spec.check is None or spec.check(value) is not None)
-        )
+        return isinstance(value, str) and (not spec.choices or value in spec.choices)
     kinds = (int,) if spec.type == 'integer' else (int, float)
     if isinstance(value, bool) or not isinstance(value, kinds):
         return False
-    if spec.check is not None:
-        spec.check(value)
     # Comparisons reject NaN.
     return spec.lower <= value <= spec.upper or (spec.or_zero and value == 0)
 

@@ -78,6 +78,14 @@ class RobotSpec:
         return replace(self, joints=joints, command=command)
 
 
+def check_joint_prefix(prefix: str) -> None:
+    """Raise ValueError if a prefix has more than `LONGEST_JOINT_PREFIX` characters."""
+    if len(prefix) > LONGEST_JOINT_PREFIX:
+        raise ValueError(
+            f'joint_prefix of {len(prefix)} characters; allowed: up to {LONGEST_JOINT_PREFIX}'
+        )
+
+
 def read_joint_prefix(robot: RobotSpec, prefix: str) -> str:
     """Return the prefix of joint names for the value `prefix` of the parameter `joint_prefix`.
 

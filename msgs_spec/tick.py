@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from msgs_spec.arrays import Array
 from msgs_spec.codecs import TopicCodec, build_status
 from msgs_spec.observations import Readings
-from msgs_spec.robots import JOINT_PREFIX, LONGEST_JOINT_PREFIX
+from msgs_spec.robots import JOINT_PREFIX, check_joint_prefix
 from msgs_spec.schemas import deserialize, message_class, serialize
 from msgs_spec.tasks import (
     REWARD_TYPES,
@@ -108,8 +108,7 @@ class EpisodeStatus:
             given = [each for each in fields(cls) if each.name in values]
             status = cls(**{each.name: _read(each, values[each.name]) for each in given})
             substeps_per_tick(status.control_hz)
-            if (length := len(status.joint_prefix)) > LONGEST_JOINT_PREFIX:
-                raise ValueError(f'joint_prefix of {length} characters')
+            check_joint_prefix(status.joint_prefix)
         except ValueError as error:
             raise ValueError(f'episode_status with {error}') from None
         return status

@@ -16,7 +16,7 @@ from typing import TypeVar
 
 from msgs_spec.disturbances import Disturbances
 from msgs_spec.parameters import LARGEST_PERTURBATION
-from msgs_spec.robots import JOINT_PREFIX, LONGEST_JOINT_PREFIX
+from msgs_spec.robots import JOINT_PREFIX, check_joint_prefix
 from msgs_spec.tasks import (
     DEFAULT_CONTROL_HZ,
     PHYSICS_TIMESTEP,
@@ -191,10 +191,7 @@ def integer_or_none(metadata: Strings, name: str) -> int | None:
 
 def _joint_prefix(metadata: Strings) -> str:
     prefix = metadata.get('joint_prefix', JOINT_PREFIX)
-    if len(prefix) > LONGEST_JOINT_PREFIX:
-        raise ValueError(
-            f'joint_prefix of {len(prefix)} characters; allowed: {LONGEST_JOINT_PREFIX}'
-        )
+    check_joint_prefix(prefix)
     return prefix
 
 

@@ -25,13 +25,14 @@ every_parameter = pytest.mark.parametrize('spec', SPECS.values(), ids=SPECS)
         ('sim.task', 'fetchreach', "'fetchreach' given; .*; did you mean 'FetchReach'\\?$"),
         ('sim.task', 3, 'task: 3 given; allowed: '),
         ('sim.seed', -1, 'seed: -1 given; allowed: whole numbers 0 ... 4294967295'),
-        ('sim.joint_prefix', 5, 'joint_prefix: 5 given; allowed: text of up to 64 .*two pairs of'),
+        ('sim.joint_prefix', 5, 'joint_prefix: 5 given; allowed: text; .* two pairs of'),
         ('sim.seed', True, 'seed: True given; allowed: '),
         ('sim.reward_type', '', "reward_type: '' given; allowed: 'sparse', 'dense'"),
         ('sim.control_hz', 30.0, 'control_hz 30 is not a whole number .*29.4117647 and 31.25'),
+        ('sim.control_hz', 1000.0, 'control_hz: 1000.0 given; allowed: 12.5 ... 500$'),
         ('sim.real_time_factor', math.nan, 'factor: nan given; allowed: 0 or 0.01 ... 1000'),
         ('sim.command_timeout', True, 'command_timeout: True given; allowed: a number, 0 ... 3600'),
-        ('sim.joint_prefix', 'x' * 65, 'given; allowed: text of up to 64 characters$'),
+        ('sim.joint_prefix', 'x' * 65, 'joint_prefix of 65 characters; allowed: up to 64$'),
         ('sim.episode_dir', 1, '1 given; allowed: text; .*: "episode_dir:=\'2026\'"$'),
         ('sim.wait_for_commands', 1, 'wait_for_commands: 1 given; allowed: true, false'),
         ('policy.task', 'Fetch', "task: 'Fetch' given; allowed: '', 'FetchReach', "),
@@ -66,8 +67,6 @@ def make_node():
 def test_the_default_is_allowed_and_survives_ros2_param_dump_and_load(spec):
     """`ros2 param load` parses the text of each dumped value as YAML, as `-p` does."""
     validate(spec, spec.default)
-    if spec.longest is not None:
-        validate(spec, 'x' * spec.longest)
     assert spec.description.endswith('.')
     parameter_module = pytest.importorskip('rclpy.parameter')
     message = parameter_module.get_parameter_value(str(spec.default))
