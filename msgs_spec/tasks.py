@@ -22,7 +22,7 @@ from typing import Any, Literal, get_args
 # Third-party tasks import it from here.
 from msgs_spec.arrays import Array as Array
 from msgs_spec.robots import FETCH, FINGERTIPS, JOINT_PREFIX, SHADOW_HAND, RobotSpec
-from msgs_spec.text import did_you_mean, one_line
+from msgs_spec.text import one_line, one_of
 
 # One physics substep, seconds, and the paper's 20 substeps per action (25 Hz).
 PHYSICS_TIMESTEP = 0.002
@@ -275,11 +275,7 @@ def task_spec(
         control_hz: Action frequency, Hz. Episodes have the same duration at all frequencies; the
             number of steps is rounded.
     """
-    try:
-        task = TASKS[name]
-    except (KeyError, TypeError):
-        hint = did_you_mean(str(name), TASKS.keys())
-        raise ValueError(f'unknown task {name!r}; allowed: {", ".join(TASKS)}{hint}') from None
+    task = TASKS[one_of(name, list(TASKS), 'unknown task')]
     if control_hz != DEFAULT_CONTROL_HZ:
         substeps = task.episode_ticks * substeps_per_tick(DEFAULT_CONTROL_HZ)
         ticks = round(substeps / substeps_per_tick(control_hz))

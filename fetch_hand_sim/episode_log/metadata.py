@@ -22,7 +22,6 @@ from msgs_spec.tasks import (
     PHYSICS_TIMESTEP,
     REWARD_TYPES,
     SUCCESS_RULES,
-    TASKS,
     TIMINGS,
     RewardType,
     SuccessRule,
@@ -166,8 +165,7 @@ class HasOutcome:
 
 def parse_task(metadata: Strings) -> TaskSpec:
     """Return the task with the joint names of the messages; ValueError if a value is invalid."""
-    name = _text(metadata, 'task')
-    return task_spec(name if name in TASKS else name[:_SHOWN], _joint_prefix(metadata))
+    return task_spec(_text(metadata, 'task'), _joint_prefix(metadata))
 
 
 def parse_control_hz(metadata: Strings) -> float:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_spec.tasks import TASKS, TaskSpec, substeps_per_tick, task_spec
+from msgs_spec.tasks import TaskSpec, substeps_per_tick, task_spec
 from msgs_spec.text import one_line
 from policy_node.policies.files import (
     LARGEST_HEADER,
@@ -219,13 +219,11 @@ def _check_format(path: str | Path, metadata: dict[str, str]) -> None:
 
 
 def _check_sizes(path: str | Path, info: ActorInfo) -> None:
-    if info.task not in TASKS:
-        raise ValueError(f'{path} was trained on unknown task {info.task!r:.80}')
-    spec = TASKS[info.task]
     try:
+        spec = task_spec(info.task)
         goal_features(info.goal_features, spec)
     except ValueError as error:
-        raise ValueError(f'{path} has {one_line(error)}') from None
+        raise ValueError(f'{path} has {error}') from None
     if not 0 <= info.past_actions <= MOST_PAST_ACTIONS:
         raise ValueError(
             f'{path} has past_actions {info.past_actions!s:.80}; allowed: 0 ... {MOST_PAST_ACTIONS}'

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from msgs_spec.tasks import GoalKind, TaskSpec
+from msgs_spec.text import one_of
 
 # A NumPy array or a torch tensor; functions return the same kind.
 Array = Any
@@ -149,9 +150,7 @@ def goal_features(kind: str, spec: TaskSpec) -> GoalFeatures | None:
     `SymmetricObject`. Another `kind` raises ValueError; so does `symmetric` if the goal of the task
     is no object pose.
     """
-    if kind not in GOAL_FEATURES:
-        raise ValueError(f'goal_features {kind!r}; allowed: {", ".join(GOAL_FEATURES)}')
-    if kind == 'plain':
+    if one_of(kind, GOAL_FEATURES, 'goal_features') == 'plain':
         return None
     relative = RelativeGoal(
         spec.goal, spec.achieved_goal_start, spec.position_counts, spec.ignores_z_rotation
