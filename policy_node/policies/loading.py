@@ -147,6 +147,8 @@ def load_policy(
         else:
             path = actor_path(name, (RANDOM, RESTING, ROBUST))
         loaded = _read(path, task, trust)
+        if task not in (None, loaded.task):
+            raise ValueError(f'{path} was trained on {loaded.task}, not on {task}')
     spec = task_spec(loaded.task)
     goal = np.zeros(spec.goal.size)
     zeros = {'observation': np.zeros(spec.observation_size), 'achieved_goal': goal}
@@ -180,7 +182,7 @@ def _read(path: Path, task: str | None, trust: bool) -> LoadedPolicy:
     if path.suffix == '.onnx':
         from policy_node.policies.onnx import load_onnx
 
-        return load_onnx(path, task)
+        return load_onnx(path)
     if path.suffix == '.zip':
         from policy_node.policies.stable_baselines3 import load_stable_baselines3
 
@@ -192,7 +194,7 @@ def _read(path: Path, task: str | None, trust: bool) -> LoadedPolicy:
         return load_stable_baselines3(path, _require_task(path.name, task))
     from policy_node.policies.numpy_actor import load_checkpoint
 
-    return load_checkpoint(path, task)
+    return load_checkpoint(path)
 
 
 def _require_task(name: str, task: str | None) -> str:

@@ -88,12 +88,8 @@ def _blas() -> ThreadpoolController:
     return ThreadpoolController().select(user_api='blas')
 
 
-def load_checkpoint(path: Path, task: str | None = None) -> LoadedPolicy:
-    """Load a checkpoint for running.
-
-    Raises:
-        ValueError: If the file is invalid, of an unknown version, or not of the given `task`.
-    """
-    found = checkpoint.read(path, task)
+def load_checkpoint(path: Path) -> LoadedPolicy:
+    """Load a checkpoint for running; ValueError if it is invalid or of an unknown version."""
+    found = checkpoint.read(path)
     actor = NumpyActor(found.info.shape, found.tensors)
     return checkpoint.loaded_actor(actor, found.info, path, found.sha256)

@@ -74,12 +74,12 @@ class OnnxActor(NetworkPolicy):
             raise ValueError(f'{path} has sizes {one_line(found)}; {self.info.task} has {wanted}')
 
 
-def load_onnx(path: Path, task: str | None = None) -> LoadedPolicy:
+def load_onnx(path: Path) -> LoadedPolicy:
     """Load an ONNX file as a policy.
 
     Raises:
-        ValueError: If onnxruntime is missing, or the file is invalid, needs too much memory or
-            time, or has another task than `task` (None allows all).
+        ValueError: If onnxruntime is missing, or the file is invalid or needs too much memory or
+            time.
     """
     data = read_file(path)
     if _EXTERNAL.search(data):
@@ -88,8 +88,6 @@ def load_onnx(path: Path, task: str | None = None) -> LoadedPolicy:
     _require_onnxruntime(path)
     _try_out(data, path)
     actor = OnnxActor(data, path)
-    if task is not None and actor.info.task != task:
-        raise ValueError(f'{path} was trained on {actor.info.task}, not on {task}')
     return loaded_actor(actor, actor.info, path, sha256(data))
 
 
