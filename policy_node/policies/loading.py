@@ -231,7 +231,7 @@ def is_python_name(name: str) -> bool:
 
 @contextlib.contextmanager
 def working_directory_first() -> Iterator[None]:
-    """Put the working directory first in `sys.path` during the block, and last after it.
+    """Put the working directory first in `sys.path` during the block, and last if it is new there.
 
     Executables otherwise search their own folder first. In the last place, the directory hides no
     installed module from later imports.
@@ -242,7 +242,8 @@ def working_directory_first() -> Iterator[None]:
         yield
     finally:
         sys.path.remove(here)
-        sys.path.append(here)
+        if here not in sys.path:
+            sys.path.append(here)
 
 
 def _load_python(name: str, task: str) -> LoadedPolicy:

@@ -103,6 +103,7 @@ def test_an_object_acts_with_its_predict(module: str) -> None:
     bare = load_policy(f'{module}:Bare', 'FetchReach', trust=True)
     answer = bare.predict(observations(task_spec('FetchReach'), 3))
     assert answer[0].tolist() == action.tolist() and answer[1] is None, 'the action alone'
+    assert sys.path.count(str(Path.cwd())) == 1
     with pytest.raises(ValueError, match='50 Hz; the robot runs at 25 Hz'):
         found.require_rate(25.0)
 
