@@ -14,6 +14,8 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from msgs_spec.text import did_you_mean, entries, one_line
 
 Span = tuple[float, float]
@@ -47,7 +49,7 @@ class Kind:
         """Return the field `name` as a number or, for ranges, a pair; ValueError if not allowed."""
         given = list(value) if self.is_range and isinstance(value, (list, tuple)) else [value]
         is_right = len(given) in (1, 1 + self.is_range) and all(
-            isinstance(each, (int, float))
+            isinstance(each, (int, float, np.integer, np.floating))
             and not isinstance(each, bool)
             and self.lowest <= each <= self.highest
             and not (self.is_whole and each != int(each))

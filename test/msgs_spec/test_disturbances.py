@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 
@@ -26,6 +27,13 @@ def test_one_number_stands_for_a_range() -> None:
     found = read_disturbances('{"action": {"latency": 2}, "physics": {"friction": [0.5, 2]}}')
     assert found.action.latency == (2, 2)
     assert found.physics.friction == (0.5, 2.0)
+
+
+def test_numpy_numbers_are_plain_ones() -> None:
+    noise = np.float32(0.25)
+    found = read_disturbances({'action': {'latency': list(np.arange(1, 3)), 'noise': noise}})
+    assert found.as_dict() == {'action': {'latency': [1, 2], 'noise': 0.25}}
+    assert Disturbances.from_json(found.to_json()) == found
 
 
 def test_scaling_follows_the_meaning_of_a_field() -> None:
