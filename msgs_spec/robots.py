@@ -61,11 +61,6 @@ class RobotSpec:
         """Length of action and command: 4 for Fetch, 20 for the hand."""
         return len(self.command)
 
-    @property
-    def has_normalised_command(self) -> bool:
-        """True if all limits of the command are -1 and 1, so that commands equal actions."""
-        return all(part.lower == -1.0 and part.upper == 1.0 for part in self.command)
-
     def with_joint_prefix(self, prefix: str) -> RobotSpec:
         """Return a copy with `prefix`, such as `rh_`, in place of `robot0:` in the joint names."""
 
@@ -186,13 +181,13 @@ def command_limits(robot: RobotSpec) -> tuple[Array, Array]:
 def command_from_action(robot: RobotSpec, action: ArrayLike) -> NDArray[Any]:
     """Map actions (..., action_size), clipped to [-1, 1], to commands of the same shape.
 
-    For Fetch, the command equals the action and keeps its floating type, because Gymnasium-Robotics
-    scales it in that type. For other robots, -1 and 1 map to the limits of the command.
+    -1 and 1 map to the limits of the command. If these are -1 and 1, as for Fetch, the command
+    keeps the floating type of the action, because Gymnasium-Robotics scales it in that type.
     """
     clipped = np.asarray(np.clip(np.asarray(action), -1.0, 1.0))
-    if robot.has_normalised_command:
-        return clipped
     lower, upper = command_limits(robot)
+    if (lower == -1.0).all() and (upper == 1.0).all():
+        return clipped
     command = (upper + lower) / 2.0 + clipped * ((upper - lower) / 2.0)
     return np.asarray(np.clip(command, lower, upper))
 
@@ -200,10 +195,8 @@ def command_from_action(robot: RobotSpec, action: ArrayLike) -> NDArray[Any]:
 def action_from_command(robot: RobotSpec, command: ArrayLike) -> Array:
     """Map commands (..., action_size) to actions, clipped to [-1, 1], of the same shape."""
     values = np.asarray(command, dtype=np.float64)
-    if not robot.has_normalised_command:
-        lower, upper = command_limits(robot)
-        values = (values - (upper + lower) / 2.0) / ((upper - lower) / 2.0)
-    return np.clip(values, -1.0, 1.0)
+    lower, upper = command_limits(robot)
+    return np.clip((values - (upper + lower) / 2.0) / ((upper - lower) / 2.0), -1.0, 1.0)
 
 
 def resting_command(robot: RobotSpec) -> Array:
