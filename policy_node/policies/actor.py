@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -81,13 +79,6 @@ class Actor(nn.Module, NetworkPolicy):
         self.observation_normalizer = Normalizer(shape.input_size)
         self.goal_normalizer = Normalizer(shape.goal_size)
         self.network = MLP(shape.feature_size, shape.action_size, shape)
-
-    @classmethod
-    def from_arrays(cls, shape: NetworkShape, arrays: Mapping[str, NDArray[np.float32]]) -> Actor:
-        """Return an actor for inference; `arrays` are its tensors by their `state_dict` names."""
-        actor = cls(shape)
-        actor.load_state_dict({name: torch.tensor(value) for name, value in arrays.items()})
-        return actor.eval().requires_grad_(False)
 
     def features(self, observation: Tensor, goal: Tensor) -> Tensor:
         """Return the normalised network input (..., feature_size).

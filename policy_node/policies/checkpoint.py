@@ -161,11 +161,15 @@ def read_info(path: str | Path) -> ActorInfo:
 
 
 def load(path: str | Path, task: str | None = None) -> tuple[Actor, ActorInfo]:
-    """Load a torch actor and its metadata; ValueError if the file is invalid or not of `task`."""
+    """Load a torch actor, without gradients, and its metadata; raises ValueError as `read` does."""
+    import torch
+
     from policy_node.policies.actor import Actor
 
     checkpoint = read(path, task)
-    return Actor.from_arrays(checkpoint.info.shape, checkpoint.tensors), checkpoint.info
+    actor = Actor(checkpoint.info.shape)
+    actor.load_state_dict({name: torch.tensor(v) for name, v in checkpoint.tensors.items()})
+    return actor.eval().requires_grad_(False), checkpoint.info
 
 
 def loaded_actor(policy: Policy, info: ActorInfo, path: Path, digest: str) -> LoadedPolicy:
