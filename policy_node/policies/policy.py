@@ -173,18 +173,17 @@ class RestingPolicy(MemorylessPolicy):
 
 
 def _action_shape(observation: Observation, action_size: int) -> tuple[int, ...]:
-    _require_mapping(observation, 'observation')
+    _require_mapping(observation)
     return (*np.shape(observation['observation'])[:-1], action_size)
 
 
-def _require_mapping(observation: object, key: str) -> None:
+def _require_mapping(observation: object) -> None:
     if not isinstance(observation, Mapping):
         given = type(observation).__name__
-        raise TypeError(f'observation of type {given}; allowed: a mapping with {key!r}')
+        raise TypeError(f"observation of type {given}; allowed: a mapping with 'observation'")
 
 
 def _part(observation: Observation, key: str, size: int) -> NDArray[np.float32]:
-    _require_mapping(observation, key)
     if key not in observation:
         raise ValueError(f'observation has no {key!r}; given: {", ".join(observation)}')
     values = np.asarray(observation[key], dtype=np.float32)
@@ -204,6 +203,7 @@ def observation_and_goal(
         ValueError: If a part is missing or has a wrong shape.
         TypeError: If the observation is not a mapping.
     """
+    _require_mapping(observation)
     seen = _part(observation, 'observation', observation_size)
     goal = _part(observation, 'desired_goal', goal_size)
     if seen.shape[:-1] == goal.shape[:-1]:
