@@ -32,8 +32,6 @@ CLOCK = QosSpec(depth=1, reliability='reliable', durability='volatile')
 # Meaning of the messages of an episode. In version 1, which recorded no number, a robot ignored
 # frame and stamp of a goal, and the orientations of `fingertip_poses` were identity.
 INTERFACE_VERSION = 2
-# Size of the cache of topics. Each joint prefix makes another task, so a limit is needed.
-_TASKS = 256
 WORLD = 'world'
 # A namespace without the slashes around it, or the name of a node.
 NAMESPACE = re.compile(r'(?:[A-Za-z_]\w*(?:/[A-Za-z_]\w*)*)?', re.ASCII)
@@ -263,7 +261,8 @@ def relative_name(resolved: str) -> str:
     return f'{GROUND_TRUTH}/{name}' if is_true_state else name
 
 
-@lru_cache(maxsize=_TASKS)
+# Each joint prefix makes another task, so the cache needs a limit.
+@lru_cache(maxsize=256)
 def topics(task: TaskSpec) -> tuple[TopicSpec, ...]:
     """Return the topics of `sim_node` for a task, without `ground_truth_topics` and `MONITORING`.
 
@@ -295,9 +294,6 @@ def topic(task: TaskSpec, name: str) -> TopicSpec:
 
 # Topics of `visualization_node`, for standard tools; none of them is logged.
 
-# Prefix by which tools group the scalars of a tick.
-_SCALARS = 'scalars/'
-
 _FRAMES = 'tf2_msgs/msg/TFMessage'
 _IMAGES = 'sensor_msgs/msg/'
 SHOWN = (
@@ -328,10 +324,9 @@ SHOWN = (
 def _scalar(name: str, unit: str, text: str) -> TopicSpec:
     """Return topic `scalars/<name>`, a number in `vector.x` of a `Vector3Stamped` message."""
     layout = (VectorPart(name, 1, unit),)
-    return TopicSpec(f'{_SCALARS}{name}', 'geometry_msgs/msg/Vector3Stamped', text, layout)
+    return TopicSpec(f'scalars/{name}', 'geometry_msgs/msg/Vector3Stamped', text, layout)
 
 
-@lru_cache(maxsize=_TASKS)
 def scalar_topics(task: TaskSpec) -> tuple[TopicSpec, ...]:
     """Return the `scalars/` topics, for plots of distance, rotation, reward and success.
 
@@ -356,7 +351,6 @@ def scalar_topics(task: TaskSpec) -> tuple[TopicSpec, ...]:
     )
 
 
-@lru_cache(maxsize=_TASKS)
 def view_topics(task: TaskSpec) -> tuple[TopicSpec, ...]:
     """Return all topics of `visualization_node` for a task."""
     return (*SHOWN, *scalar_topics(task))
