@@ -357,18 +357,19 @@ def _accept(name: str, spec: Any) -> TaskSpec:
 
 def third_party_simulation(name: str) -> Any:
     """Return the class that simulates a third-party task; ValueError if missing or broken."""
-    found = entry_points(group=SIMULATIONS, name=name)
+    found = list(entry_points(group=SIMULATIONS, name=name))
+    if not found:
+        raise ValueError(
+            f'task {name} has no simulation: no installed package has an entry point of this name '
+            f'in {SIMULATIONS!r}'
+        )
     # Several packages may use the name: prefer the package of the specification.
     own = [each for each in found if _package(each) == _PACKAGES.get(name)]
-    for entry_point in own or found:
-        try:
-            return entry_point.load()
-        except (Exception, SystemExit) as error:
-            raise ValueError(f'task {name}: {_failure(entry_point, error)}') from error
-    raise ValueError(
-        f'task {name} has no simulation: no installed package has an entry point of this name in '
-        f'{SIMULATIONS!r}'
-    )
+    entry_point = (own or found)[0]
+    try:
+        return entry_point.load()
+    except (Exception, SystemExit) as error:
+        raise ValueError(f'task {name}: {_failure(entry_point, error)}') from error
 
 
 def _package(entry_point: EntryPoint) -> str:
