@@ -87,7 +87,7 @@ RANDOM, RESTING, ROBUST = 'random', 'resting', 'robust'
 # The first answers of a library take longest.
 _WARM_UP_CALLS = 20
 _PYTHON_NAME = re.compile(r'[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*')
-# For help texts and descriptions of parameters.
+# For help texts.
 POLICY_NAMES = (
     'a shipped actor (FetchReach), a file (.safetensors, .onnx; .zip of Stable-Baselines3 if you '
     'trust it), a function of yours (module:function, if you trust it), random, resting, or robust '
