@@ -215,13 +215,11 @@ class _FunctionPolicy(MemorylessPolicy):
     def act(self, observation: Observation) -> NDArray[Any]:
         parts = {name: np.asarray(values) for name, values in observation.items()}
         leading = parts['observation'].shape[:-1]
-        if not leading:
-            return np.asarray(self._function(parts))
         rows = [
-            self._function({name: values[index] for name, values in parts.items()})
+            np.asarray(self._function({name: values[index] for name, values in parts.items()}))
             for index in np.ndindex(leading)
         ]
-        return np.reshape(np.asarray(rows), (*leading, -1))
+        return np.reshape(rows, (*leading, *np.shape(rows)[1:]))
 
 
 def is_python_name(name: str) -> bool:
