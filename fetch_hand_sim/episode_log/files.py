@@ -9,6 +9,7 @@ from __future__ import annotations
 import errno
 import fcntl
 import os
+import shlex
 import stat
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
@@ -133,12 +134,21 @@ def folders_below(directory: Path) -> str:
 
 
 def _hint(directory: Path) -> str:
-    below = folders_below(directory)
-    return f'; there are some in {below}' if below else ''
+    """Return a text that starts with `; ` and names other episodes of a folder; '' if none."""
+    if below := folders_below(directory):
+        return f'; there are some in {below}'
+    with suppress(OSError):
+        if any(map(active_name, directory.iterdir())):
+            folder = shlex.quote(str(directory))
+            return (
+                f'; some are unfinished: `fetch_hand_sim episodes recover {folder}` completes '
+                'those that no process writes'
+            )
+    return ''
 
 
 def holds_no_episode(directory: Path) -> EpisodeReadError:
-    """Return an error for a folder without episodes; its text names subfolders that have some."""
+    """Return an error for a folder without episodes; it names subfolders and unfinished ones."""
     return EpisodeReadError(f'{directory} holds no episode{_hint(directory)}')
 
 

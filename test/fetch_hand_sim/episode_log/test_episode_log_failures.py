@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 from mcap.writer import Writer
 
-from fetch_hand_sim.commands import episodes_recover
+from fetch_hand_sim.commands import episodes_check, episodes_recover
 from fetch_hand_sim.episode_log import (
     EpisodeDirectory,
     EpisodeExistsError,
@@ -196,6 +196,13 @@ def test_a_leftover_without_readable_messages_is_put_aside(finished, active, nam
     assert [path.name for path in active.parent.iterdir()] == ['.episode.aside']
     assert (active.parent / '.episode.aside' / name).read_bytes() == data
     assert find_leftovers(active.parent) == []
+
+
+def test_the_error_of_a_folder_with_unfinished_episodes_alone_names_their_remedy(active, capsys):
+    folder = active.parent
+    assert episodes_check.main([str(folder)]) == 2
+    remedy = f'some are unfinished: `fetch_hand_sim episodes recover {folder}`'
+    assert f'{folder} holds no episode; {remedy}' in capsys.readouterr().err
 
 
 def test_an_episode_whose_directory_is_cleared_away_while_it_begins_takes_the_next_number(
