@@ -279,8 +279,9 @@ class EpisodeDirectory:
     """Creates the writers of numbered episodes in a directory.
 
     Numbers continue after those of existing episodes, so no episode is overwritten. Several
-    processes may share the directory: a number belongs to the first process that creates its hidden
-    directory, and other processes use the next number.
+    processes may share the directory. A name belongs to the first process that creates its hidden
+    directory. Another process uses the next number for the same seed; with another seed it may use
+    the same number.
     """
 
     def __init__(self, path: Path | str, namespace: str = '/') -> None:
