@@ -26,11 +26,7 @@ from bench_view import start  # noqa: E402
 from msgs_spec.tasks import TASKS, task_spec  # noqa: E402
 from msgs_spec.topics import topic, view_topics  # noqa: E402
 from node_runtime.event_loop import EventLoop  # noqa: E402
-from node_runtime.ros import (  # noqa: E402
-    keep_discovery_local,
-    rclpy_profile,
-    ros_message_class,
-)
+from node_runtime.ros import keep_discovery_local, subscribe  # noqa: E402
 
 _TICKS_PER_SECOND = os.sysconf('SC_CLK_TCK')
 # Seconds before each measurement.
@@ -51,13 +47,7 @@ def look(task: str, name: str, seconds: float) -> None:
     rclpy.init()
     node, sizes = rclpy.create_node('looking'), list[int]()
     source = {each.name: each for each in view_topics(task_spec(task))}[name]
-    node.create_subscription(
-        ros_message_class(source.type_name),
-        source.name,
-        lambda data: sizes.append(len(data)),
-        rclpy_profile(source.qos),
-        raw=True,
-    )
+    subscribe(node, source, lambda data: sizes.append(len(data)), raw=True)
     loop = EventLoop(node)
     for duration in (_SETTLING, seconds):
         sizes.clear()

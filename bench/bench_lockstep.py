@@ -34,18 +34,13 @@ from msgs_spec.codecs import TopicCodec, decode_status  # noqa: E402
 from msgs_spec.observations import ObservationAssembler  # noqa: E402
 from msgs_spec.tasks import TASKS, TaskSpec, task_spec  # noqa: E402
 from msgs_spec.tick import TickEncoder  # noqa: E402
-from msgs_spec.topics import (  # noqa: E402
-    DIAGNOSTICS,
-    STATE,
-    topic,
-    topics,
-)
+from msgs_spec.topics import DIAGNOSTICS, STATE, topic, topics  # noqa: E402
 from node_runtime.event_loop import EventLoop  # noqa: E402
-from node_runtime.ros import (  # noqa: E402  # noqa: E402
+from node_runtime.ros import (  # noqa: E402
     keep_discovery_local,
     leave_out_shared_memory,
-    rclpy_profile,
-    ros_message_class,
+    open_publisher,
+    subscribe,
 )
 
 SUBSTEPS = 20
@@ -63,19 +58,12 @@ def echo(spec: TaskSpec) -> None:
     rclpy.init()
     node = rclpy.create_node('echo')
     commands = topic(spec, 'commands')
-    publisher = node.create_publisher(
-        ros_message_class(commands.type_name), 'commands', rclpy_profile(commands.qos)
-    )
+    publisher = open_publisher(node, commands)
     command = TopicCodec(commands).encode(0, np.zeros(commands.size))
     *others, last = observed(spec)
-    for name in (*others, last):
-        node.create_subscription(
-            ros_message_class(topic(spec, name).type_name),
-            name,
-            (lambda data: publisher.publish(command)) if name == last else (lambda data: None),
-            rclpy_profile(STATE),
-            raw=True,
-        )
+    for name in others:
+        subscribe(node, topic(spec, name), lambda data: None, qos=STATE, raw=True)
+    subscribe(node, topic(spec, last), lambda data: publisher.publish(command), qos=STATE, raw=True)
     loop = EventLoop(node)
     while True:
         loop.wait(1.0)
@@ -116,20 +104,8 @@ class Limit:
         def on_command(data: bytes) -> None:
             answers[0] += 1
 
-        commands = topic(self._spec, 'commands')
-        node.create_subscription(
-            ros_message_class(commands.type_name),
-            'commands',
-            on_command,
-            rclpy_profile(commands.qos),
-            raw=True,
-        )
-        publishers = {
-            source.name: node.create_publisher(
-                ros_message_class(source.type_name), source.name, rclpy_profile(source.qos)
-            )
-            for source, _ in self._messages
-        }
+        subscribe(node, topic(self._spec, 'commands'), on_command, raw=True)
+        publishers = {source.name: open_publisher(node, source) for source, _ in self._messages}
         other = start(Path(__file__), '--task', self._spec.name, '--echo')
         try:
             needed = [publishers[name] for name in observed(self._spec)]
@@ -168,12 +144,7 @@ def measure_nodes(spec: TaskSpec, policy: str, seconds: float) -> float:
         if 'ticks' in values:
             counts.append((time.perf_counter(), int(values['ticks'])))
 
-    node.create_subscription(
-        ros_message_class(DIAGNOSTICS.type_name),
-        DIAGNOSTICS.name,
-        on_report,
-        rclpy_profile(DIAGNOSTICS.qos),
-    )
+    subscribe(node, DIAGNOSTICS, on_report)
     sim = ['-p', f'task:={spec.name}', '-p', 'mode:=lockstep', '-p', 'wait_for_commands:=true']
     arguments = ['--ros-args', '-p', f'policy:={policy}'] if policy else []
     processes = [

@@ -14,7 +14,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -31,11 +30,10 @@ from msgs_spec.tasks import TASKS, task_spec  # noqa: E402
 from msgs_spec.topics import DIAGNOSTICS, TopicSpec, topic  # noqa: E402
 from node_runtime.diagnostics import MISSED_TICKS  # noqa: E402
 from node_runtime.event_loop import EventLoop  # noqa: E402
-from node_runtime.ros import (  # noqa: E402  # noqa: E402
+from node_runtime.ros import (  # noqa: E402
     keep_discovery_local,
     leave_out_shared_memory,
-    rclpy_profile,
-    ros_message_class,
+    subscribe,
 )
 
 
@@ -45,16 +43,10 @@ class Watcher:
     def __init__(self, joint_states: TopicSpec) -> None:
         self.times: list[float] = []
         self.missed = 0
-        self._node = rclpy.create_node('watcher')
-        for spec, callback in ((joint_states, self._on_state), (DIAGNOSTICS, self._on_report)):
-            self.subscribe(spec, callback, raw=spec is joint_states)
-        self._loop = EventLoop(self._node)
-
-    def subscribe(self, spec: TopicSpec, callback: Callable[[Any], None], raw: bool) -> None:
-        """Subscribes to a topic, as bytes if `raw`."""
-        self._node.create_subscription(
-            ros_message_class(spec.type_name), spec.name, callback, rclpy_profile(spec.qos), raw=raw
-        )
+        self.node = rclpy.create_node('watcher')
+        subscribe(self.node, joint_states, self._on_state, raw=True)
+        subscribe(self.node, DIAGNOSTICS, self._on_report)
+        self._loop = EventLoop(self.node)
 
     def watch(self, seconds: float) -> None:
         """Serves callbacks for this long."""
@@ -163,8 +155,11 @@ def main() -> int:
             times, missed = measure_beside(programs, watcher, options.seconds)
             report(label, times, missed, options.real_time_factor)
         commands: list[float] = []
-        watcher.subscribe(
-            topic(spec, 'commands'), lambda data: commands.append(time.perf_counter()), raw=True
+        subscribe(
+            watcher.node,
+            topic(spec, 'commands'),
+            lambda data: commands.append(time.perf_counter()),
+            raw=True,
         )
         for _ in range(5):
             seconds = first_command(watcher, options.task, commands)

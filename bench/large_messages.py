@@ -14,11 +14,10 @@ import rclpy  # noqa: E402
 from msgs_spec.codecs import TopicCodec  # noqa: E402
 from msgs_spec.tasks import task_spec  # noqa: E402
 from msgs_spec.topics import topic  # noqa: E402
-from node_runtime.ros import (  # noqa: E402  # noqa: E402
+from node_runtime.ros import (  # noqa: E402
     keep_discovery_local,
     leave_out_shared_memory,
-    rclpy_profile,
-    ros_message_class,
+    open_publisher,
 )
 
 BYTES = 10_000_000
@@ -32,9 +31,7 @@ def main() -> None:
     commands = topic(task_spec('FetchReach'), 'commands')
     large = TopicCodec(commands).encode(0, [0.0] * 4) + bytes(BYTES)
     node = rclpy.create_node('large_messages')
-    publisher = node.create_publisher(
-        ros_message_class(commands.type_name), commands.name, rclpy_profile(commands.qos)
-    )
+    publisher = open_publisher(node, commands)
     while True:
         publisher.publish(large)
         time.sleep(0.1)
