@@ -20,7 +20,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / 'bench')]
 
 import rclpy  # noqa: E402
-from bench_rate import Watcher, report  # noqa: E402
+from bench_rate import Watcher  # noqa: E402
 from bench_view import start  # noqa: E402
 
 from msgs_spec.tasks import TASKS, task_spec  # noqa: E402
@@ -63,13 +63,12 @@ def look(task: str, name: str, seconds: float) -> None:
 
 def measure(watcher: Watcher, pid: int, label: str, seconds: float) -> None:
     """Prints the figures of one measurement."""
-    watcher.watch(_SETTLING)
-    watcher.times.clear()
-    missed, used = watcher.missed, processor_seconds(pid)
+    watcher.start(_SETTLING)
+    used = processor_seconds(pid)
     watcher.watch(seconds)
     share = 100.0 * (processor_seconds(pid) - used) / seconds
     print(f'{label}: visualization_node takes {share:.1f} % of a processor', flush=True)
-    report('  joint_states', watcher.times, watcher.missed - missed, 1.0)
+    watcher.report('  joint_states')
 
 
 def main() -> None:

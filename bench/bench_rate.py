@@ -14,6 +14,8 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +44,7 @@ class Watcher:
 
     def __init__(self, joint_states: TopicSpec) -> None:
         self.times: list[float] = []
-        self.missed = 0
+        self._missed = self._missed_before = 0
         self.node = rclpy.create_node('watcher')
         subscribe(self.node, joint_states, self._on_state, raw=True)
         subscribe(self.node, DIAGNOSTICS, self._on_report)
@@ -62,46 +64,41 @@ class Watcher:
                 raise SystemExit(f'bench_rate: no joint_states within {timeout:g} s')
             self._loop.wait(0.1)
 
+    def start(self, settling: float) -> None:
+        """Serves callbacks for `settling` seconds, then starts a measurement."""
+        self.watch(settling)
+        self.times.clear()
+        self._missed_before = self._missed
+
+    def report(self, label: str, factor: float = 1.0) -> None:
+        """Prints the periods and missed ticks since `start`; `factor` is the real-time factor."""
+        periods = 1e3 * np.diff(self.times)
+        wanted = 40.0 / factor
+        late = np.abs(periods - wanted)
+        low, high = np.percentile(periods, (1, 99))
+        print(
+            f'{label}: {len(periods)} periods, {1e3 / periods.mean():.3f} Hz, std '
+            f'{periods.std():.3f} ms, p1 {low:.3f}, p99 {high:.3f} ms, '
+            f'|period - {wanted:g} ms| median {np.median(late):.3f}, p99 '
+            f'{np.percentile(late, 99):.3f}, max {late.max():.3f} ms; '
+            f'{self._missed - self._missed_before} ticks missed; '
+            f'load average {os.getloadavg()[0]:.1f}',
+            flush=True,
+        )
+
     def _on_state(self, data: bytes) -> None:
         self.times.append(time.perf_counter())
 
     def _on_report(self, message: Any) -> None:
-        self.missed = int(decode_status(message).get(MISSED_TICKS, self.missed))
+        self._missed = int(decode_status(message).get(MISSED_TICKS, self._missed))
 
 
-def report(label: str, times: list[float], missed: int, factor: float) -> None:
-    """Prints the figures of one measurement."""
-    periods = 1e3 * np.diff(times)
-    wanted = 40.0 / factor
-    late = np.abs(periods - wanted)
-    low, high = np.percentile(periods, (1, 99))
-    print(
-        f'{label}: {len(periods)} periods, {1e3 / periods.mean():.3f} Hz, std '
-        f'{periods.std():.3f} ms, p1 {low:.3f}, p99 {high:.3f} ms, '
-        f'|period - {wanted:g} ms| median {np.median(late):.3f}, p99 '
-        f'{np.percentile(late, 99):.3f}, max {late.max():.3f} ms; {missed} ticks missed; '
-        f'load average {os.getloadavg()[0]:.1f}',
-        flush=True,
-    )
-
-
-def measure_beside(
-    programs: list[list[str]], watcher: Watcher, seconds: float
-) -> tuple[list[float], int]:
-    """Watches the robot while other programs run; returns arrival times and ticks missed.
-
-    Args:
-        programs: What Python is started with, for each.
-        watcher: Listens to the robot.
-        seconds: How long, after a while to settle.
-    """
+@contextmanager
+def running(programs: list[list[str]]) -> Iterator[None]:
+    """Runs Python with these arguments, one process each, until the block ends."""
     others = [subprocess.Popen([sys.executable, *program], cwd=ROOT) for program in programs]
     try:
-        watcher.watch(4.0)
-        watcher.times.clear()
-        before = watcher.missed
-        watcher.watch(seconds)
-        return list(watcher.times), watcher.missed - before
+        yield
     finally:
         for process in others:
             process.kill()
@@ -152,8 +149,10 @@ def main() -> int:
     try:
         watcher.wait_for_ticks()
         for label, programs in phases if options.busy else phases[:2]:
-            times, missed = measure_beside(programs, watcher, options.seconds)
-            report(label, times, missed, options.real_time_factor)
+            with running(programs):
+                watcher.start(4.0)
+                watcher.watch(options.seconds)
+                watcher.report(label, options.real_time_factor)
         commands: list[float] = []
         subscribe(
             watcher.node,

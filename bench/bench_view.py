@@ -23,7 +23,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / 'bench'), str(ROOT / 'test')]
 
 import numpy as np  # noqa: E402
 import rclpy  # noqa: E402
-from bench_rate import Watcher, report  # noqa: E402
+from bench_rate import Watcher  # noqa: E402
 
 from msgs_spec.tasks import TASKS, task_spec  # noqa: E402
 from msgs_spec.topics import topic  # noqa: E402
@@ -64,18 +64,15 @@ def open_view(stack: ExitStack) -> tuple[subprocess.Popen[str], str]:
 
 
 def measure(watcher: Watcher, label: str, seconds: float) -> None:
-    """Watches a robot in real time for a while and prints what was seen."""
-    watcher.watch(2.0)
-    watcher.times.clear()
-    before = watcher.missed
+    """Watches a robot in real time and prints its rate."""
+    watcher.start(2.0)
     watcher.watch(seconds)
-    report(label, watcher.times, watcher.missed - before, 1.0)
+    watcher.report(label)
 
 
 def rate(watcher: Watcher, seconds: float) -> float:
     """Ticks per second from now on."""
-    watcher.watch(_SETTLING)
-    watcher.times.clear()
+    watcher.start(_SETTLING)
     began = time.monotonic()
     watcher.watch(seconds)
     return len(watcher.times) / (time.monotonic() - began)
