@@ -74,12 +74,12 @@ def start(*command: object) -> subprocess.Popen[bytes]:
     return subprocess.Popen([sys.executable, *map(str, command)], cwd=ROOT)
 
 
-def wait_until(loop: EventLoop, condition: Any, what: str) -> None:
+def wait_until(loop: EventLoop, condition: Any, what: str, timeout: float = TIMEOUT) -> None:
     """Serves callbacks until a condition holds."""
-    end = time.monotonic() + TIMEOUT
+    end = time.monotonic() + timeout
     while not condition():
         if time.monotonic() > end:
-            raise SystemExit(f'bench_lockstep: no {what} within {TIMEOUT:g} s')
+            raise SystemExit(f'bench_lockstep: no {what} within {timeout:g} s')
         loop.wait(0.05)
 
 
@@ -154,9 +154,11 @@ def measure_nodes(spec: TaskSpec, policy: str, seconds: float) -> float:
     try:
         wait_until(loop, lambda: counts and counts[-1][1] > 100, 'ticks')
         counts.clear()
-        end = time.perf_counter() + seconds + 1.0
-        while time.perf_counter() < end:
-            loop.wait(0.1)
+
+        def is_measured() -> bool:
+            return bool(counts) and counts[-1][0] - counts[0][0] >= seconds
+
+        wait_until(loop, is_measured, 'tick counter', TIMEOUT + seconds)
     finally:
         for process in processes:
             process.send_signal(signal.SIGINT)

@@ -106,7 +106,9 @@ def running(programs: list[list[str]]) -> Iterator[None]:
 
 
 def first_command(watcher: Watcher, task: str, commands: list[float]) -> float:
-    """Starts a policy; returns the seconds until it commands, which is noted in `commands`."""
+    """Starts a policy; returns the seconds until `commands` gets the arrival of its first one."""
+    # The previous policy has sent more commands than the first, which are still queued.
+    watcher.watch(1.0)
     commands.clear()
     started = time.perf_counter()
     words = ['-m', 'policy_node.node', '--ros-args', '-p', f'task:={task}']
