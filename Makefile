@@ -109,10 +109,7 @@ docs: env
 	@echo 'build/docs/index.html'
 
 tables: env
-	$(BIN)/python tools/interface_table.py --write docs/interface.md
-	$(BIN)/python tools/readme_tables.py --write README.md docs/speed.md docs/results.md
-	$(BIN)/python tools/task_pages.py --write
-	$(BIN)/python tools/robustness_overview.py
+	$(BIN)/python tools/make_tables.py
 
 pictures: env
 	$(BIN)/python tools/make_pictures.py

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-import runpy
+import sys
 from pathlib import Path
 
 DOCS = Path(__file__).resolve().parent
 ROOT = DOCS.parent
 
 # What only the package knows: its commands, and what can be set in training.
-runpy.run_path(str(ROOT / 'tools' / 'reference_pages.py'))['write_pages'](DOCS / 'generated')
+sys.path.insert(0, str(ROOT / 'tools'))
+from reference_pages import write_pages  # noqa: E402
+
+write_pages(DOCS / 'generated')
 
 project = 'fetch_hand_sim'
 author = 'The fetch_hand_sim maintainers'

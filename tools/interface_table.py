@@ -1,23 +1,17 @@
-"""The tables of docs/interface.md, generated from `msgs_spec`.
-
-`python tools/interface_table.py` prints them, `--write docs/interface.md` puts them in the page.
-"""
+"""The tables of docs/interface.md, generated from `msgs_spec`."""
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
-import sys
 from collections.abc import Callable, Iterable, Sequence
-from pathlib import Path
+
+from markdown_table import table
 
 from msgs_spec.parameters import NODES, ParameterSpec
 from msgs_spec.robots import FETCH, FINGERTIPS, JOINT_PREFIX, SHADOW_HAND
 from msgs_spec.tasks import TASKS, GoalKind, TaskSpec, VectorPart
 from msgs_spec.tick import PHASES, EpisodeStatus
 from msgs_spec.topics import MONITORING, SERVICES, QosSpec, TopicSpec, topics, view_topics
-
-START, END = '<!-- interface table -->', '<!-- /interface table -->'
 
 _PUBLISHING = (
     'All messages of a tick that have a header carry one stamp; simulated time starts at 1 s.\n'
@@ -68,25 +62,6 @@ def interface_markdown() -> str:
     return '\n\n'.join(f'## {title}\n\n{text}' for title, text in parts)
 
 
-def replace_section(text: str) -> str:
-    """Returns a page with what is between its markers replaced.
-
-    Raises:
-        ValueError: If the two markers are not there, once each and in order.
-    """
-    if text.count(START) != 1 or text.count(END) != 1 or text.index(START) > text.index(END):
-        raise ValueError(f'allowed: a file with one {START} and, after it, one {END}')
-    before, rest = text.split(START)
-    after = rest.split(END)[1]
-    return f'{before}{START}\n\n{interface_markdown()}\n\n{END}{after}'
-
-
-def _table(header: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
-    titles = list(header)
-    lines = [titles, ['---'] * len(titles), *rows]
-    return '\n'.join(f'| {" | ".join(cells)} |' for cells in lines)
-
-
 def _code(text: str) -> str:
     return f'`{text}`'
 
@@ -126,7 +101,7 @@ def _topic_table(topics_of: Callable[[TaskSpec], Iterable[TopicSpec]]) -> str:
         for spec in topics_of(task):
             tasks.setdefault(spec, []).append(task)
     names = _topic_names(topics_of)
-    return _table(
+    return table(
         ('topic', 'type', 'tasks', 'values', 'unit', 'frame', 'QoS', 'content'),
         (
             (
@@ -171,7 +146,7 @@ def _names(names: Sequence[str]) -> str:
 
 
 def _command_table() -> str:
-    return _table(
+    return table(
         ('robot', 'index', 'value', 'lowest', 'highest', 'unit'),
         (
             (
@@ -201,12 +176,12 @@ def _observation_table() -> str:
             start += part.size
         goal = users[0].goal
         rows.append((_family(users), f'0 ... {goal.size - 1}', 'either goal', goal.name.lower()))
-    return _table(('tasks', 'indices', 'part', 'unit'), rows)
+    return table(('tasks', 'indices', 'part', 'unit'), rows)
 
 
 def _parameter_table() -> str:
     rows = [(node, spec) for node, specs in NODES.items() for spec in specs]
-    return _table(
+    return table(
         ('node', 'parameter', 'type', 'default', 'allowed', 'at run time', 'meaning'),
         (
             (
@@ -231,30 +206,10 @@ def _allowed(spec: ParameterSpec) -> str:
 
 
 def _service_table() -> str:
-    return _table(
+    return table(
         ('service', 'type', 'node', 'what it does'),
         (
             (_code(spec.name), spec.type_name.replace('/srv/', '/'), spec.node, spec.description)
             for spec in SERVICES
         ),
     )
-
-
-def main(args: list[str] | None = None) -> int:
-    """Prints or writes the section; returns the exit code."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument('--write', type=Path, metavar='PAGE', help='file to update')
-    path: Path | None = parser.parse_args(args).write
-    if path is None:
-        print(interface_markdown())
-        return 0
-    try:
-        path.write_text(replace_section(path.read_text(encoding='utf-8')), encoding='utf-8')
-    except (OSError, UnicodeDecodeError, ValueError) as error:
-        print(f'interface_table: {path}: {error}', file=sys.stderr)
-        return 1
-    return 0
-
-
-if __name__ == '__main__':
-    sys.exit(main())

@@ -8,8 +8,10 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+
+from markdown_table import table
 
 from fetch_hand_sim.__main__ import COMMANDS, Command
 from msgs_spec.tasks import TASKS
@@ -42,16 +44,16 @@ def commands_page() -> str:
         '# Commands\n\n`fetch_hand_sim <command>`. The nodes and `view` are also executables for '
         '`ros2 run fetch_hand_sim`. What each command prints for `--help`:'
     ]
-    for path, command in leaves(COMMANDS):
+    for path, command in leaves():
         parts.append(f'## {" ".join(path)}\n\n{_sentence(command.help)}')
         parts.append(f'```\n{help_of(path)}\n```')
     return '\n\n'.join(parts) + '\n'
 
 
 def leaves(
-    commands: dict[str, Command], path: tuple[str, ...] = ()
+    commands: Mapping[str, Command] = COMMANDS, path: tuple[str, ...] = ()
 ) -> Iterator[tuple[tuple[str, ...], Command]]:
-    """Yields every command that runs something, with the words that name it."""
+    """Yield the words and the entry of every command that runs a module."""
     for name, command in commands.items():
         if command.commands:
             yield from leaves(command.commands, (*path, name))
@@ -85,7 +87,7 @@ def train_config_page() -> str:
         for title in dict.fromkeys(each.group for each in fields):
             rows = [_row(each) for each in fields if each.group == title]
             parts.append(f'## {prefix}{title}')
-            parts.append(_table(('field', 'default', 'allowed', 'meaning'), rows))
+            parts.append(table(('field', 'default', 'allowed', 'meaning'), rows))
     parts.append(
         '## Recipes\n\nValues that differ from the default. `paper` is given for FetchPush; hand '
         'manipulation has episodes of twice as many ticks.'
@@ -110,13 +112,8 @@ def _recipes() -> str:
         if name != 'recipe' and any(value != default for value in values):
             cells = ['' if value == default else _code(value_text(value)) for value in values]
             rows.append((_code(name), *cells))
-    return _table(('field', *(name for name, _ in columns)), rows)
+    return table(('field', *(name for name, _ in columns)), rows)
 
 
 def _code(text: str) -> str:
     return f'`{text}`' if text else ''
-
-
-def _table(header: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
-    lines = [header, ('---',) * len(header), *rows]
-    return '\n'.join(f'| {" | ".join(cells)} |' for cells in lines)

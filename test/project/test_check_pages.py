@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import re
-import runpy
 from pathlib import Path
 
 import pytest
+from check_pages import findings, idioms, main
 
 from support import ROOT
 
-TOOL = runpy.run_path(str(ROOT / 'tools' / 'check_pages.py'))
-
 
 def test_the_pages_pass(capsys: pytest.CaptureFixture[str]) -> None:
-    assert TOOL['main']([]) == 0, capsys.readouterr().out
+    assert main([]) == 0, capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -29,14 +27,14 @@ def test_the_pages_pass(capsys: pytest.CaptureFixture[str]) -> None:
 def test_a_problem_on_a_page_is_found(text: str, problem: str, tmp_path: Path) -> None:
     page = tmp_path / 'page.md'
     page.write_text(text)
-    (found,) = TOOL['findings'](page)
+    (found,) = findings(page)
     assert problem in found
 
 
 def test_idioms_are_counted(tmp_path: Path) -> None:
     page = tmp_path / 'page.md'
     page.write_text('Who draws a picture gets a line. Nothing else is wrong here.\n')
-    assert TOOL['idioms'](page) == (['Who draws a picture gets a line.'], 2)
+    assert idioms(page) == (['Who draws a picture gets a line.'], 2)
 
 
 @pytest.mark.parametrize(

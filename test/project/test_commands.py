@@ -11,13 +11,14 @@ import sys
 from importlib.metadata import distribution
 
 import pytest
+from reference_pages import leaves
 
 from fetch_hand_sim.__main__ import main
 from fetch_hand_sim.commands.node_processes import executable
 from node_runtime.command_line import EXTRAS
 from node_runtime.signals import EXECUTABLES
 from support import script_environment
-from support.entry_points import console_scripts, leaves, started_as_modules
+from support.entry_points import console_scripts, started_as_modules
 
 # Modules that each command needs beyond the base installation.
 NEEDS = {

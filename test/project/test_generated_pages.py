@@ -6,11 +6,13 @@ import ast
 import hashlib
 import json
 import re
-import runpy
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from interface_table import interface_markdown
+from make_tables import renewed, sections
+from reference_pages import help_of, leaves, train_config_page
 
 from msgs_spec.parameters import NODES
 from msgs_spec.robots import SHADOW_HAND
@@ -21,27 +23,13 @@ from policy_node.training.configuration.config import FIELDS
 from policy_node.training.configuration.recipes import recipe_config
 from support import PACKAGES, ROOT
 
-INTERFACE, README, REFERENCE, TASK_PAGES = (
-    runpy.run_path(str(ROOT / 'tools' / f'{name}.py'))
-    for name in ('interface_table', 'readme_tables', 'reference_pages', 'task_pages')
-)
-RENEWED: dict[Path, Callable[[str], str]] = {
-    ROOT / 'docs' / 'interface.md': INTERFACE['replace_section'],
-    **{
-        ROOT / name: README['with_tables']
-        for name in ('README.md', 'docs/speed.md', 'docs/results.md')
-    },
-    **{
-        path: lambda page, section=section: TASK_PAGES['with_section'](page, section)
-        for path, section in TASK_PAGES['sections']().items()
-    },
-}
+SECTIONS = sections()
 
 
-@pytest.mark.parametrize('path', RENEWED, ids=lambda path: path.stem)
+@pytest.mark.parametrize('path', SECTIONS, ids=lambda path: path.stem)
 def test_a_page_has_the_present_tables(path: Path) -> None:
     page = path.read_text(encoding='utf-8')
-    assert RENEWED[path](page) == page, 'run: make tables'
+    assert renewed(page, SECTIONS[path]) == page, 'run: make tables'
 
 
 def test_the_readme_is_short() -> None:
@@ -68,7 +56,7 @@ def test_every_topic_parameter_and_service_has_its_row() -> None:
         f'| {n} | `{spec.name}` | {spec.type} |' for n, specs in NODES.items() for spec in specs
     }
     rows |= {f'| `{spec.name}` |' for spec in SERVICES}
-    page = INTERFACE['interface_markdown']()
+    page = interface_markdown()
     assert [row for row in rows if f'\n{row}' not in page] == []
 
 
@@ -84,7 +72,7 @@ def test_the_joints_of_the_hand_have_both_numberings() -> None:
 
 
 def test_every_field_of_training_has_a_row_with_its_meaning_and_recipe() -> None:
-    fields, _, recipes = REFERENCE['train_config_page']().partition('## Recipes')
+    fields, _, recipes = train_config_page().partition('## Recipes')
     rows = [line.split(' | ') for line in fields.splitlines()]
     meanings = {row[0].strip('| `'): row[-1].strip(' |') for row in rows if len(row) >= 4}
     assert [name for name in FIELDS if not meanings.get(name)] == []
@@ -94,8 +82,8 @@ def test_every_field_of_training_has_a_row_with_its_meaning_and_recipe() -> None
 
 
 def test_a_command_is_shown_with_its_help() -> None:
-    assert ('episodes', 'list') in dict(REFERENCE['leaves'](REFERENCE['COMMANDS']))
-    text = REFERENCE['help_of'](('episodes', 'list'))
+    assert ('episodes', 'list') in dict(leaves())
+    text = help_of(('episodes', 'list'))
     assert text.startswith('usage: fetch_hand_sim episodes list [-h]')
 
 

@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Iterator
 
 from gymnasium.envs.registration import registry
+from reference_pages import leaves
 
 from fetch_hand_sim.gym_envs.registration import reference_ids
 from msgs_spec.parameters import NODES
@@ -14,7 +15,7 @@ from msgs_spec.tick import PHASES, EpisodeStatus
 from msgs_spec.topics import MONITORING, SERVICES, topics
 from policy_node.training.configuration.config import FIELDS
 from support import ROOT
-from support.entry_points import console_scripts, leaves
+from support.entry_points import console_scripts
 
 # One promise per line, written by `write` when 1.0 was released. Lines may be added, never changed.
 PROMISED = ROOT / 'test' / 'data' / 'promises_1_0.txt'

@@ -1,11 +1,9 @@
-"""Everything that users can start: executables, commands, and modules for `python -m`."""
+"""The installed programs, and the modules that `python -m` can start."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
 from importlib.metadata import distribution
 
-from fetch_hand_sim.__main__ import COMMANDS, Command
 from support import ROOT
 
 
@@ -13,17 +11,6 @@ def console_scripts() -> dict[str, tuple[str, str]]:
     """Module and function of each installed program, by name."""
     points = distribution('fetch_hand_sim').entry_points.select(group='console_scripts')
     return {point.name: (point.module, point.attr) for point in points}
-
-
-def leaves(
-    commands: Mapping[str, Command] = COMMANDS, path: tuple[str, ...] = ()
-) -> Iterator[tuple[tuple[str, ...], Command]]:
-    """Yield the words and the entry of every command that runs a module."""
-    for name, command in commands.items():
-        if command.commands:
-            yield from leaves(command.commands, (*path, name))
-        else:
-            yield (*path, name), command
 
 
 def started_as_modules() -> list[str]:

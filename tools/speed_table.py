@@ -1,23 +1,13 @@
-"""The tables of results in README.md, docs/speed.md and docs/results.md.
-
-Shipped actors come from the evaluation files beside them, speed from the last `make bench-sim`.
-
-python tools/readme_tables.py --write README.md docs/speed.md docs/results.md
-"""
+"""The table of docs/speed.md, from the results of the last `make bench-sim`."""
 
 from __future__ import annotations
 
-import argparse
 import csv
 import statistics
-import sys
 from collections.abc import Iterable
 from pathlib import Path
 
-from policy_node.training.studies.published import actors_summary, actors_table
-
 ROOT = Path(__file__).resolve().parent.parent
-ACTORS = ROOT / 'policy_node' / 'actors'
 SPEED = ROOT / 'bench' / 'results' / 'bench_sim.csv'
 
 
@@ -62,52 +52,3 @@ def _measured(path: Path) -> tuple[str, int, list[dict[str, dict[str, str]]]]:
 
 def _without_comments(text: str) -> Iterable[str]:
     return (line for line in text.splitlines() if not line.startswith('#'))
-
-
-TABLES = {
-    'results': lambda: actors_table(ACTORS),
-    'results, short': lambda: actors_summary(ACTORS),
-    'speed': speed_table,
-}
-
-
-def with_tables(page: str) -> str:
-    """Returns a page with the present tables between its markers.
-
-    Raises:
-        ValueError: If there are no markers, or one without the other.
-    """
-    found = False
-    for name, table in TABLES.items():
-        first, last = f'<!-- {name} -->', f'<!-- /{name} -->'
-        before, begin, rest = page.partition(first)
-        _, end, after = rest.partition(last)
-        if bool(begin) != bool(end):
-            raise ValueError(f'no {first} ... {last}')
-        if begin:
-            found = True
-            page = f'{before}{first}\n\n{table()}\n\n{last}{after}'
-    if not found:
-        raise ValueError(f'no markers; allowed: {", ".join(f"<!-- {name} -->" for name in TABLES)}')
-    return page
-
-
-def main() -> int:
-    """Prints or writes the tables; returns the exit code."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument('--write', type=Path, nargs='+', metavar='PAGE', help='pages to update')
-    paths: list[Path] | None = parser.parse_args().write
-    if paths is None:
-        print('\n\n'.join(table() for table in TABLES.values()))
-        return 0
-    for path in paths:
-        try:
-            path.write_text(with_tables(path.read_text(encoding='utf-8')), encoding='utf-8')
-        except (OSError, ValueError) as error:
-            print(f'readme_tables: {path}: {error}', file=sys.stderr)
-            return 1
-    return 0
-
-
-if __name__ == '__main__':
-    sys.exit(main())
