@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import csv
 import statistics
-from collections.abc import Iterable
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 SPEED = ROOT / 'bench' / 'results' / 'bench_sim.csv'
 
 
-def speed_table(path: Path = SPEED) -> str:
-    """Returns the Markdown table of environment steps per second, and what it was measured on."""
-    machine, threads, (one, many) = _measured(path)
+def speed_table() -> str:
+    """Return the Markdown table of environment steps per second, and the machine."""
+    machine, *table = SPEED.read_text(encoding='utf-8').splitlines()
+    rows = list(csv.DictReader(table))
+    threads = sorted({int(row['threads']) for row in rows})[:2]
+    one, many = ({r['task']: r for r in rows if int(r['threads']) == n} for n in threads)
     lines = [
         '| task | this project | of bare physics | EnvPool | x EnvPool | Gymnasium-Robotics, one '
-        f'process | x that | {threads} threads | of bare physics | x EnvPool '
+        f'process | x that | {threads[1]} threads | of bare physics | x EnvPool '
         '| x one process of Gymnasium-Robotics |',
         '| --- |' + ' ---: |' * 10,
     ]
@@ -38,17 +40,4 @@ def speed_table(path: Path = SPEED) -> str:
     lines.append(
         f'| *geometric mean* | | | | {means[0]:.2f} | | | | | {means[1]:.2f} | {means[2]:.1f} |'
     )
-    return '\n'.join([*lines, '', f'({machine})'])
-
-
-def _measured(path: Path) -> tuple[str, int, list[dict[str, dict[str, str]]]]:
-    """The machine, the larger number of threads, and the rows by task of one and of that many."""
-    text = path.read_text(encoding='utf-8')
-    rows = list(csv.DictReader(_without_comments(text)))
-    threads = sorted({int(row['threads']) for row in rows})[:2]
-    tables = [{r['task']: r for r in rows if int(r['threads']) == n} for n in threads]
-    return text.splitlines()[0].lstrip('# '), threads[1], tables
-
-
-def _without_comments(text: str) -> Iterable[str]:
-    return (line for line in text.splitlines() if not line.startswith('#'))
+    return '\n'.join([*lines, '', f'({machine.lstrip("# ")})'])

@@ -30,24 +30,23 @@ _ARMS = {
 }
 
 
-def task_section(task: TaskSpec, actors: Path = ACTORS) -> str:
+def task_section(task: TaskSpec) -> str:
     """Returns all that is generated of a task's page, as GitHub Markdown."""
     parts = [
         ('The task in numbers', _contract(task)),
         ('Observation', _observation(task)),
         ('Published results', _published(task)),
-        ('Our policy', _actor(task, actors)),
-        ('Try it', _commands(task, actors)),
+        ('Our policy', _actor(task)),
+        ('Try it', _commands(task.name)),
     ]
     return '\n\n'.join(f'## {title}\n\n{text}' for title, text in parts)
 
 
-def index_section(actors: Path = ACTORS) -> str:
+def index_section() -> str:
     """Returns the table of all tasks."""
     rows = []
     for task in _thirteen():
-        report = _report(task, actors)
-        success = f'{report["success_gymnasium"]:.3f}' if report else 'none shipped'
+        success = f'{_report(task)["success_gymnasium"]:.3f}'
         name = f'[{task.name}]({task.name}.md)'
         rows.append((name, str(task.observation_size), _success(task), success))
     return table(('task', 'observation', 'success', 'our policy'), rows)
@@ -121,16 +120,13 @@ def _published(task: TaskSpec) -> str:
     return table(('source and steps', 'success', 'how read'), rows)
 
 
-def _report(task: TaskSpec, actors: Path) -> dict[str, Any] | None:
-    path = actors / f'{task.name}.json'
-    return json.loads(path.read_text(encoding='utf-8')) if path.is_file() else None
+def _report(task: TaskSpec) -> dict[str, Any]:
+    report: dict[str, Any] = json.loads((ACTORS / f'{task.name}.json').read_text(encoding='utf-8'))
+    return report
 
 
-def _actor(task: TaskSpec, actors: Path) -> str:
-    report = _report(task, actors)
-    if report is None:
-        text = 'No policy is shipped yet.'
-        return f'{text} {_ceiling(task)}'.rstrip()
+def _actor(task: TaskSpec) -> str:
+    report = _report(task)
     lower, upper = report['success_gymnasium_interval_95']
     rows = [
         (
@@ -190,15 +186,12 @@ def _ceiling(task: TaskSpec) -> str:
     )
 
 
-def _commands(task: TaskSpec, actors: Path) -> str:
-    lines = [
-        f'make demo TASK={task.name}',
-        f'fetch_hand_sim view --task {task.name}',
-        f'fetch_hand_sim train --task {task.name}',
-    ]
-    if _report(task, actors):
-        lines.insert(2, f'fetch_hand_sim evaluate --policy {task.name} --episodes 1000')
-    return '\n'.join(f'    {line}' for line in lines)
+def _commands(task: str) -> str:
+    return f"""\
+    make demo TASK={task}
+    fetch_hand_sim view --task {task}
+    fetch_hand_sim evaluate --policy {task} --episodes 1000
+    fetch_hand_sim train --task {task}"""
 
 
 def sections() -> dict[Path, str]:
