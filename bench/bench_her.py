@@ -87,12 +87,14 @@ class Run:
                 print(self._run['competitor'], self._run['task'], line, end='', flush=True)
 
 
-def measure(tasks: Sequence[str], options: argparse.Namespace) -> list[Row]:
+def measure(tasks: Sequence[str], options: argparse.Namespace) -> tuple[list[Row], bool]:
     """Trains all competitors on the tasks, in turn or side by side.
 
-    Ctrl-C ends it; evaluations until then are returned, with the time they came as the limit.
+    Returns:
+        The evaluations, and whether Ctrl-C ended them; then their limit is the time of the last.
     """
     runs: list[Run] = []
+    is_interrupted = False
     try:
         for task, competitor in itertools.product(tasks, options.competitors):
             runs.append(Run(competitor, task, options))
@@ -101,6 +103,7 @@ def measure(tasks: Sequence[str], options: argparse.Namespace) -> list[Row]:
         for run in runs:
             run.wait()
     except KeyboardInterrupt:
+        is_interrupted = True
         print('bench_her: interrupted; limits are where the competitors were', file=sys.stderr)
         for run in runs:
             run.stop()
@@ -109,7 +112,7 @@ def measure(tasks: Sequence[str], options: argparse.Namespace) -> list[Row]:
     finally:
         for run in runs:
             run.stop()
-    return [row for run in runs for row in run.rows]
+    return [row for run in runs for row in run.rows], is_interrupted
 
 
 def summarize(rows: Sequence[Row]) -> list[Row]:
@@ -251,7 +254,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options.output.mkdir(parents=True, exist_ok=True)
     rows: list[Row] = []
     for tasks in [options.tasks] if options.side_by_side else [[task] for task in options.tasks]:
-        rows += measure(tasks, options)
+        found, is_interrupted = measure(tasks, options)
+        rows += found
         if not rows:
             return 1
         summary = summarize(rows)
@@ -259,8 +263,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         write_csv(summary, list(summary[0]), options.output / 'bench_her.csv', machine)
         (options.output / 'bench_her.md').write_text(f'{machine}\n\n{table(summary)}\n')
         plot(rows, options.output / 'bench_her.png', machine)
+        if is_interrupted:
+            break
     print(f'\n{machine}\n\n{table(summary)}')
-    return 0
+    return 130 if is_interrupted else 0
 
 
 if __name__ == '__main__':

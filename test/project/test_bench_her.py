@@ -3,23 +3,10 @@
 from __future__ import annotations
 
 import csv
-import importlib.util
 from pathlib import Path
-from types import ModuleType
 
+import bench_her
 import pytest
-
-from support import ROOT
-
-BENCH = ROOT / 'bench' / 'bench_her.py'
-
-
-@pytest.fixture(scope='module')
-def bench_her() -> ModuleType:
-    spec = importlib.util.spec_from_file_location('bench_her', BENCH)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 def evaluations(competitor: str, *points: tuple[float, int, float]) -> list[dict[str, object]]:
@@ -32,7 +19,7 @@ OURS = evaluations('this_project', (10.0, 1000, 0.5), (20.0, 2000, 0.95))
 SLOW = evaluations('sb3_sac', (40.0, 3000, 0.1), (100.1, 6000, 0.94))
 
 
-def test_the_first_evaluation_with_the_target_counts(bench_her: ModuleType) -> None:
+def test_the_first_evaluation_with_the_target_counts() -> None:
     back = evaluations('sb3_tqc', (50.0, 700, 0.96), (60.0, 800, 0.2))
     summary = bench_her.summarize([*OURS, *SLOW, *back])
     assert [row['reached'] for row in summary] == [True, False, True]
@@ -47,9 +34,31 @@ def test_the_first_evaluation_with_the_target_counts(bench_her: ModuleType) -> N
     assert ratios == [None, None], 'a failed run has no ratio'
 
 
+def test_ctrl_c_ends_all_tasks_and_keeps_the_evaluations(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class InterruptedRun:
+        def __init__(self, competitor: str, task: str, options: object) -> None:
+            started.append(task)
+            self.rows = [row | {'task': task} for row in OURS]
+
+        def wait(self) -> None:
+            raise KeyboardInterrupt
+
+        def stop(self) -> None:
+            pass
+
+    started: list[str] = []
+    monkeypatch.setattr(bench_her, 'Run', InterruptedRun)
+    arguments = ['--competitors', 'this_project', '--output', str(tmp_path)]
+    assert bench_her.main(arguments) == 130
+    assert started == ['FetchPush']
+    assert 'FetchPush | this project' in (tmp_path / 'bench_her.md').read_text()
+
+
 @pytest.mark.release
 def test_competitors_train_on_the_same_task(
-    bench_her: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     arguments = ['--tasks', 'FetchReach', '--competitors', 'this_project', 'sb3_sac']
     arguments += ['--limit', '1', '--episodes', '5', '--evaluate-every', '500', '--threads', '1']
