@@ -16,17 +16,14 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).resolve().parents[1]
-sys.path[:0] = [str(ROOT), str(ROOT / 'bench')]
+import rclpy
+from bench_rate import Watcher
+from bench_view import start
 
-import rclpy  # noqa: E402
-from bench_rate import Watcher  # noqa: E402
-from bench_view import start  # noqa: E402
-
-from msgs_spec.tasks import TASKS, task_spec  # noqa: E402
-from msgs_spec.topics import topic, view_topics  # noqa: E402
-from node_runtime.event_loop import EventLoop  # noqa: E402
-from node_runtime.ros import keep_discovery_local, subscribe  # noqa: E402
+from msgs_spec.tasks import TASKS, task_spec
+from msgs_spec.topics import topic, view_topics
+from node_runtime.event_loop import EventLoop
+from node_runtime.ros import keep_discovery_local, subscribe
 
 _TICKS_PER_SECOND = os.sysconf('SC_CLK_TCK')
 # Seconds before each measurement.

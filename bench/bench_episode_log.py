@@ -19,20 +19,17 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT))
+import numpy as np
+from rich.console import Console
+from rich.table import Table
 
-import numpy as np  # noqa: E402
-from rich.console import Console  # noqa: E402
-from rich.table import Table  # noqa: E402
-
-from fetch_hand_sim.episodes.recorder import EpisodeRecorder, RecordingContext  # noqa: E402
-from fetch_hand_sim.episodes.runner import EpisodeRunner  # noqa: E402
-from fetch_hand_sim.simulation import Simulation  # noqa: E402
-from msgs_spec.codecs import TopicCodec  # noqa: E402
-from msgs_spec.tasks import TASKS  # noqa: E402
-from msgs_spec.tick import Tick, TickEncoder  # noqa: E402
-from msgs_spec.topics import TopicSpec, topic  # noqa: E402
+from fetch_hand_sim.episodes.recorder import EpisodeRecorder, RecordingContext
+from fetch_hand_sim.episodes.runner import EpisodeRunner
+from fetch_hand_sim.simulation import Simulation
+from msgs_spec.codecs import TopicCodec
+from msgs_spec.tasks import TASKS
+from msgs_spec.tick import Tick, TickEncoder
+from msgs_spec.topics import TopicSpec, topic
 
 CONTROL_PERIOD = 0.04
 # Targets of the project.

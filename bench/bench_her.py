@@ -23,12 +23,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from msgs_spec.tasks import TASKS
+from policy_node.training.machine import processor
+
 ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT))
-
-from msgs_spec.tasks import TASKS  # noqa: E402
-from policy_node.training.machine import processor  # noqa: E402
-
 RESULTS = ROOT / 'bench' / 'results'
 OURS = 'this_project'
 LABELS = {

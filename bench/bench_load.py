@@ -18,24 +18,21 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT))
+import numpy as np
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+from rich.console import Console
+from rich.table import Table
+from rosbags.highlevel import AnyReader
 
-import numpy as np  # noqa: E402
-from mcap.reader import make_reader  # noqa: E402
-from mcap_ros2.decoder import DecoderFactory  # noqa: E402
-from rich.console import Console  # noqa: E402
-from rich.table import Table  # noqa: E402
-from rosbags.highlevel import AnyReader  # noqa: E402
-
-from fetch_hand_sim.episode_log import load_episodes, read_summary  # noqa: E402
-from fetch_hand_sim.episodes.generator import EpisodeGenerator  # noqa: E402
-from fetch_hand_sim.episodes.recorder import RecordingContext  # noqa: E402
-from fetch_hand_sim.simulation import Simulation  # noqa: E402
-from msgs_spec.codecs import decode  # noqa: E402
-from msgs_spec.observations import ObservationAssembler  # noqa: E402
-from msgs_spec.tasks import TASKS, TaskSpec, task_spec  # noqa: E402
-from msgs_spec.topics import topic  # noqa: E402
+from fetch_hand_sim.episode_log import load_episodes, read_summary
+from fetch_hand_sim.episodes.generator import EpisodeGenerator
+from fetch_hand_sim.episodes.recorder import RecordingContext
+from fetch_hand_sim.simulation import Simulation
+from msgs_spec.codecs import decode
+from msgs_spec.observations import ObservationAssembler
+from msgs_spec.tasks import TASKS, TaskSpec, task_spec
+from msgs_spec.topics import topic
 
 Arrays = list[dict[str, np.ndarray]]
 STEPS = ('reward', 'applied_command', 'is_success')

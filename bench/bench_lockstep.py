@@ -19,29 +19,28 @@ import time
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT))
-# A graph of its own; below 102, where the ports of DDS meet those of Linux.
-os.environ.setdefault('ROS_DOMAIN_ID', str(40 + os.getpid() % 62))
+import mujoco
+import numpy as np
+import rclpy
 
-import mujoco  # noqa: E402
-import numpy as np  # noqa: E402
-import rclpy  # noqa: E402
-
-from fetch_hand_sim.episodes.runner import EpisodeRunner  # noqa: E402
-from fetch_hand_sim.simulation import Simulation  # noqa: E402
-from msgs_spec.codecs import TopicCodec, decode_status  # noqa: E402
-from msgs_spec.observations import ObservationAssembler  # noqa: E402
-from msgs_spec.tasks import TASKS, TaskSpec, task_spec  # noqa: E402
-from msgs_spec.tick import TickEncoder  # noqa: E402
-from msgs_spec.topics import DIAGNOSTICS, STATE, topic, topics  # noqa: E402
-from node_runtime.event_loop import EventLoop  # noqa: E402
-from node_runtime.ros import (  # noqa: E402
+from fetch_hand_sim.episodes.runner import EpisodeRunner
+from fetch_hand_sim.simulation import Simulation
+from msgs_spec.codecs import TopicCodec, decode_status
+from msgs_spec.observations import ObservationAssembler
+from msgs_spec.tasks import TASKS, TaskSpec, task_spec
+from msgs_spec.tick import TickEncoder
+from msgs_spec.topics import DIAGNOSTICS, STATE, topic, topics
+from node_runtime.event_loop import EventLoop
+from node_runtime.ros import (
     keep_discovery_local,
     leave_out_shared_memory,
     open_publisher,
     subscribe,
 )
+
+ROOT = Path(__file__).resolve().parents[1]
+# A graph of its own; below 102, where the ports of DDS meet those of Linux.
+os.environ.setdefault('ROS_DOMAIN_ID', str(40 + os.getpid() % 62))
 
 SUBSTEPS = 20
 TIMEOUT = 60.0

@@ -19,24 +19,23 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT))
-# A graph of its own; below 102, where the ports of DDS meet those of Linux.
-os.environ.setdefault('ROS_DOMAIN_ID', str(40 + os.getpid() % 62))
+import numpy as np
+import rclpy
 
-import numpy as np  # noqa: E402
-import rclpy  # noqa: E402
-
-from msgs_spec.codecs import decode_status  # noqa: E402
-from msgs_spec.tasks import TASKS, task_spec  # noqa: E402
-from msgs_spec.topics import DIAGNOSTICS, TopicSpec, topic  # noqa: E402
-from node_runtime.diagnostics import MISSED_TICKS  # noqa: E402
-from node_runtime.event_loop import EventLoop  # noqa: E402
-from node_runtime.ros import (  # noqa: E402
+from msgs_spec.codecs import decode_status
+from msgs_spec.tasks import TASKS, task_spec
+from msgs_spec.topics import DIAGNOSTICS, TopicSpec, topic
+from node_runtime.diagnostics import MISSED_TICKS
+from node_runtime.event_loop import EventLoop
+from node_runtime.ros import (
     keep_discovery_local,
     leave_out_shared_memory,
     subscribe,
 )
+
+ROOT = Path(__file__).resolve().parents[1]
+# A graph of its own; below 102, where the ports of DDS meet those of Linux.
+os.environ.setdefault('ROS_DOMAIN_ID', str(40 + os.getpid() % 62))
 
 
 class Watcher:

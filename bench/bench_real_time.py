@@ -16,15 +16,13 @@ import tempfile
 from datetime import datetime
 from pathlib import Path
 
+from fetch_hand_sim.episode_log import EpisodeSummary, find_episodes, read_summary
+from msgs_spec.tasks import DEFAULT_CONTROL_HZ, TASKS
+from policy_node.training.machine import processor
+
 ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT))
 # A graph of its own; below 102, where the ports of DDS meet those of Linux.
 os.environ.setdefault('ROS_DOMAIN_ID', str(40 + os.getpid() % 62))
-
-from fetch_hand_sim.episode_log import EpisodeSummary, find_episodes, read_summary  # noqa: E402
-from msgs_spec.tasks import DEFAULT_CONTROL_HZ, TASKS  # noqa: E402
-from policy_node.training.machine import processor  # noqa: E402
-
 FIRST_SEED = 10_000
 DEFAULT_TASKS = ('FetchPush', 'FetchSlide', 'HandReach', 'HandManipulateBlockRotateZ')
 

@@ -25,12 +25,10 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
+from msgs_spec.tasks import TASKS
+from policy_node.training.machine import processor
+
 ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT))
-
-from msgs_spec.tasks import TASKS  # noqa: E402
-from policy_node.training.machine import processor  # noqa: E402
-
 PEERS = ROOT / '.venv-bench'
 RESULTS = ROOT / 'bench' / 'results'
 NUM_ENVS = 64

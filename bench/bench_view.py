@@ -18,16 +18,17 @@ import time
 from contextlib import ExitStack, closing
 from pathlib import Path
 
+import numpy as np
+import rclpy
+from bench_rate import Watcher
+
+from msgs_spec.tasks import TASKS, task_spec
+from msgs_spec.topics import topic
+from node_runtime.ros import keep_discovery_local
+
 ROOT = Path(__file__).resolve().parents[1]
-sys.path[:0] = [str(ROOT), str(ROOT / 'bench'), str(ROOT / 'test')]
+sys.path.append(str(ROOT / 'test'))
 
-import numpy as np  # noqa: E402
-import rclpy  # noqa: E402
-from bench_rate import Watcher  # noqa: E402
-
-from msgs_spec.tasks import TASKS, task_spec  # noqa: E402
-from msgs_spec.topics import topic  # noqa: E402
-from node_runtime.ros import keep_discovery_local  # noqa: E402
 from support.visitors import DeafVisitor, Visitor  # noqa: E402
 
 VISITORS = 3

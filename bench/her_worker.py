@@ -8,25 +8,21 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT))
+import gymnasium
+import torch
 
-import gymnasium  # noqa: E402
-import torch  # noqa: E402
-
-from fetch_hand_sim.simulation import Simulation  # noqa: E402
-from policy_node.policies.policy import Policy  # noqa: E402
-from policy_node.training.configuration.recipes import recipe_config  # noqa: E402
-from policy_node.training.evaluation import FIRST_SEED, evaluate  # noqa: E402
-from policy_node.training.runs.run_folder import RunFolder  # noqa: E402
-from policy_node.training.runs.trainer import Trainer  # noqa: E402
+from fetch_hand_sim.simulation import Simulation
+from policy_node.policies.policy import Policy
+from policy_node.training.configuration.recipes import recipe_config
+from policy_node.training.evaluation import FIRST_SEED, evaluate
+from policy_node.training.runs.run_folder import RunFolder
+from policy_node.training.runs.trainer import Trainer
 
 # Without end: the limit in seconds or the target ends a run.
 ENDLESS = 10**12

@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-import sys
 import time
-from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT))
+import rclpy
 
-import rclpy  # noqa: E402
-
-from msgs_spec.codecs import TopicCodec  # noqa: E402
-from msgs_spec.tasks import task_spec  # noqa: E402
-from msgs_spec.topics import topic  # noqa: E402
-from node_runtime.ros import (  # noqa: E402
+from msgs_spec.codecs import TopicCodec
+from msgs_spec.tasks import task_spec
+from msgs_spec.topics import topic
+from node_runtime.ros import (
     keep_discovery_local,
     leave_out_shared_memory,
     open_publisher,
