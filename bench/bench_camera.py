@@ -14,12 +14,11 @@ import sys
 import time
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
 
 import rclpy
 from bench_rate import Watcher
-from bench_view import start
 
+from fetch_hand_sim.commands.node_processes import start_node, stop_node
 from msgs_spec.tasks import TASKS, task_spec
 from msgs_spec.topics import topic, view_topics
 from node_runtime.event_loop import EventLoop
@@ -86,14 +85,15 @@ def main() -> None:
     print(f'{options.task}, {options.size} at {options.hz:g} Hz, {os.cpu_count()} CPUs', flush=True)
     with ExitStack() as stack:
         watcher = Watcher(topic(task_spec(options.task), 'joint_states'))
-        start(stack, 'fetch_hand_sim.sim_node', '--ros-args', '-p', f'task:={options.task}')
-        settings: dict[str, Any] = {
-            'camera_hz': float(options.hz),
+        sim = start_node('sim_node', {'task': options.task}, sys.stderr)
+        stack.callback(stop_node, sim)
+        camera = {
+            'camera_hz': options.hz,
             'camera_width': int(width),
             'camera_height': int(height),
         }
-        words = [word for item in settings.items() for word in ('-p', ':='.join(map(str, item)))]
-        node = start(stack, 'fetch_hand_sim.visualization_node', '--ros-args', *words)
+        node = start_node('visualization_node', camera, sys.stderr)
+        stack.callback(stop_node, node)
         watcher.wait_for_ticks()
         measure(watcher, node.pid, 'nobody looks', options.seconds)
         for name, label in (

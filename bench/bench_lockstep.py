@@ -11,18 +11,17 @@ from __future__ import annotations
 import argparse
 import os
 import platform
-import signal
 import statistics
 import subprocess
 import sys
 import time
-from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
 import rclpy
 
+from fetch_hand_sim.commands.node_processes import start_nodes, stop_node
 from fetch_hand_sim.episodes.runner import EpisodeRunner
 from fetch_hand_sim.simulation import Simulation
 from msgs_spec.codecs import TopicCodec, decode_status
@@ -38,7 +37,6 @@ from node_runtime.ros import (
     subscribe,
 )
 
-ROOT = Path(__file__).resolve().parents[1]
 # A graph of its own; below 102, where the ports of DDS meet those of Linux.
 os.environ.setdefault('ROS_DOMAIN_ID', str(40 + os.getpid() % 62))
 
@@ -66,11 +64,6 @@ def echo(spec: TaskSpec) -> None:
     loop = EventLoop(node)
     while True:
         loop.wait(1.0)
-
-
-def start(*command: object) -> subprocess.Popen[bytes]:
-    """Starts Python with these arguments."""
-    return subprocess.Popen([sys.executable, *map(str, command)], cwd=ROOT)
 
 
 def wait_until(loop: EventLoop, condition: Any, what: str, timeout: float = TIMEOUT) -> None:
@@ -105,7 +98,7 @@ class Limit:
 
         subscribe(node, topic(self._spec, 'commands'), on_command, raw=True)
         publishers = {source.name: open_publisher(node, source) for source, _ in self._messages}
-        other = start(Path(__file__), '--task', self._spec.name, '--echo')
+        other = subprocess.Popen([sys.executable, __file__, '--task', self._spec.name, '--echo'])
         try:
             needed = [publishers[name] for name in observed(self._spec)]
             wait_until(loop, lambda: all(p.get_subscription_count() for p in needed), 'echo')
@@ -144,12 +137,8 @@ def measure_nodes(spec: TaskSpec, policy: str, seconds: float) -> float:
             counts.append((time.perf_counter(), int(values['ticks'])))
 
     subscribe(node, DIAGNOSTICS, on_report)
-    sim = ['-p', f'task:={spec.name}', '-p', 'mode:=lockstep', '-p', 'wait_for_commands:=true']
-    arguments = ['--ros-args', '-p', f'policy:={policy}'] if policy else []
-    processes = [
-        start('-m', 'fetch_hand_sim.sim_node', '--ros-args', *sim),
-        start('-m', 'policy_node.node', *arguments),
-    ]
+    sim = {'task': spec.name, 'mode': 'lockstep', 'wait_for_commands': True}
+    processes = start_nodes({'sim_node': sim, 'policy_node': {'policy': policy}}, sys.stderr)
     try:
         wait_until(loop, lambda: counts and counts[-1][1] > 100, 'ticks')
         counts.clear()
@@ -160,9 +149,7 @@ def measure_nodes(spec: TaskSpec, policy: str, seconds: float) -> float:
         wait_until(loop, is_measured, 'tick counter', TIMEOUT + seconds)
     finally:
         for process in processes:
-            process.send_signal(signal.SIGINT)
-        for process in processes:
-            process.wait()
+            stop_node(process)
         loop.close()
         node.destroy_node()
     (began, first), (ended, last) = counts[0], counts[-1]

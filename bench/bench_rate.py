@@ -10,7 +10,6 @@ from __future__ import annotations
 import argparse
 import os
 import platform
-import signal
 import subprocess
 import sys
 import time
@@ -22,16 +21,13 @@ from typing import Any
 import numpy as np
 import rclpy
 
+from fetch_hand_sim.commands.node_processes import start_node, stop_node
 from msgs_spec.codecs import decode_status
 from msgs_spec.tasks import TASKS, task_spec
 from msgs_spec.topics import DIAGNOSTICS, TopicSpec, topic
 from node_runtime.diagnostics import MISSED_TICKS
 from node_runtime.event_loop import EventLoop
-from node_runtime.ros import (
-    keep_discovery_local,
-    leave_out_shared_memory,
-    subscribe,
-)
+from node_runtime.ros import keep_discovery_local, leave_out_shared_memory, subscribe
 
 ROOT = Path(__file__).resolve().parents[1]
 # A graph of its own; below 102, where the ports of DDS meet those of Linux.
@@ -110,8 +106,7 @@ def first_command(watcher: Watcher, task: str, commands: list[float]) -> float:
     watcher.watch(1.0)
     commands.clear()
     started = time.perf_counter()
-    words = ['-m', 'policy_node.node', '--ros-args', '-p', f'task:={task}']
-    policy = subprocess.Popen([sys.executable, *words], cwd=ROOT)
+    policy = start_node('policy_node', {'task': task}, sys.stderr)
     try:
         while not commands:
             watcher.watch(0.01)
@@ -119,8 +114,7 @@ def first_command(watcher: Watcher, task: str, commands: list[float]) -> float:
                 raise SystemExit('bench_rate: the policy ended')
         return commands[0] - started
     finally:
-        policy.send_signal(signal.SIGINT)
-        policy.wait()
+        stop_node(policy)
 
 
 def main() -> int:
@@ -136,10 +130,8 @@ def main() -> int:
     rclpy.init()
     spec = task_spec(options.task)
     watcher = Watcher(topic(spec, 'joint_states'))
-    parameters = [f'task:={options.task}', f'real_time_factor:={options.real_time_factor}']
-    words = [word for parameter in parameters for word in ('-p', parameter)]
-    command = [sys.executable, '-m', 'fetch_hand_sim.sim_node', '--ros-args', *words]
-    sim = subprocess.Popen(command, cwd=ROOT)
+    parameters = {'task': options.task, 'real_time_factor': options.real_time_factor}
+    sim = start_node('sim_node', parameters, sys.stderr)
     print(f'{options.task} on {platform.machine()}, {os.cpu_count()} CPUs')
     spin, send = ['-c', 'while True: pass'], ['bench/large_messages.py']
     phases: list[tuple[str, list[list[str]]]] = [
@@ -165,8 +157,7 @@ def main() -> int:
             seconds = first_command(watcher, options.task, commands)
             print(f'first command {seconds:.2f} s after the start of a policy', flush=True)
     finally:
-        sim.send_signal(signal.SIGINT)
-        code = sim.wait()
+        code = stop_node(sim)
     rclpy.shutdown()
     return code
 

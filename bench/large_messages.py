@@ -9,11 +9,7 @@ import rclpy
 from msgs_spec.codecs import TopicCodec
 from msgs_spec.tasks import task_spec
 from msgs_spec.topics import topic
-from node_runtime.ros import (
-    keep_discovery_local,
-    leave_out_shared_memory,
-    open_publisher,
-)
+from node_runtime.ros import keep_discovery_local, leave_out_shared_memory, open_publisher
 
 BYTES = 10_000_000
 
