@@ -171,12 +171,10 @@ def table(summary: Sequence[Row]) -> str:
 
 def plot(rows: Sequence[Row], path: Path, title: str) -> None:
     """Success against seconds and against environment steps, one row of panels per task."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     tasks = list(dict.fromkeys(row['task'] for row in rows))
     figure = Figure(figsize=(11, 4 * len(tasks)), layout='constrained')
-    FigureCanvasAgg(figure)
     axes = figure.subplots(len(tasks), 2, squeeze=False)
     for panels, task in zip(axes, tasks, strict=True):
         of_task = [row for row in rows if row['task'] == task]

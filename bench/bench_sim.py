@@ -43,9 +43,6 @@ IMPLEMENTATIONS = (
     'gymnasium_robotics',
 )
 IN_PEERS_ENVIRONMENT = ('envpool', 'gymnasium_robotics')
-COLUMNS = ('task', 'threads', *IMPLEMENTATIONS, *(f'ratio_{name}' for name in IMPLEMENTATIONS[1:]))
-# Steps per second with the resets between the episodes; the physics alone has none.
-RESET_COLUMNS = (f'{OURS}_with_resets', 'envpool_with_resets', 'ratio_envpool_with_resets')
 
 
 def create_peers_environment() -> None:
@@ -131,6 +128,7 @@ def measure(task: str, threads: int, episodes: int) -> dict[str, Any]:
     row |= {
         f'ratio_{name}': _median_ratio(speeds[OURS], speeds[name]) for name in IMPLEMENTATIONS[1:]
     }
+    # The physics alone has no resets.
     whole = {name: _speed_with_resets(counted[name], turns) for name in (OURS, 'envpool')}
     row |= {f'{name}_with_resets': statistics.median(values) for name, values in whole.items()}
     row['ratio_envpool_with_resets'] = _median_ratio(whole[OURS], whole['envpool'])
@@ -195,13 +193,11 @@ def table(rows: list[dict[str, Any]]) -> str:
 
 def plot(rows: list[dict[str, Any]], path: Path, title: str) -> None:
     """Bars per task, one panel per number of threads."""
-    import matplotlib
-
-    matplotlib.use('Agg')
-    from matplotlib import pyplot
+    from matplotlib.figure import Figure
 
     threads = sorted({row['threads'] for row in rows})
-    figure, axes = pyplot.subplots(len(threads), 1, figsize=(12, 4.5 * len(threads)), squeeze=False)
+    figure = Figure(figsize=(12, 4.5 * len(threads)))
+    axes = figure.subplots(len(threads), 1, squeeze=False)
     for axis, number in zip(axes[:, 0], threads, strict=True):
         part = [row for row in rows if row['threads'] == number]
         for index, name in enumerate(IMPLEMENTATIONS):
@@ -242,7 +238,7 @@ def main() -> None:
     arguments.output.mkdir(parents=True, exist_ok=True)
     with open(arguments.output / 'bench_sim.csv', 'w', newline='') as file:
         file.write(f'# {machine}\n')
-        writer = csv.DictWriter(file, [*COLUMNS, *RESET_COLUMNS], lineterminator='\n')
+        writer = csv.DictWriter(file, list(rows[0]), lineterminator='\n')
         writer.writeheader()
         writer.writerows(rows)
     plot(rows, arguments.output / 'bench_sim.png', machine)
