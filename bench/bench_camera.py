@@ -1,8 +1,8 @@
 """Measure the CPU time of `visualization_node`'s camera, with and without subscribers.
 
-`make bench-camera` runs it. A robot runs in real time, `visualization_node` beside it; in turn
-there is no subscriber, then one of raw pictures, then one of JPEG. Said is the processor time of
-`visualization_node`, what arrived of pictures, and the rate of `joint_states`.
+`make bench-camera` runs it, beside a robot in real time: without a subscriber, with one of raw
+pictures, with one of JPEG. It prints the CPU time of `visualization_node`, the pictures that
+arrived, and the rate of `joint_states`.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ def main() -> None:
         node = start_node('visualization_node', camera, sys.stderr)
         stack.callback(stop_node, node)
         watcher.wait_for_ticks()
-        measure(watcher, node.pid, 'nobody looks', options.seconds)
+        measure(watcher, node.pid, 'no subscriber', options.seconds)
         for name, label in (
             ('camera/image_raw', 'raw pictures'),
             ('camera/image_raw/compressed', 'JPEG'),
@@ -104,7 +104,7 @@ def main() -> None:
             viewer = subprocess.Popen([sys.executable, __file__, *words])
             measure(watcher, node.pid, label, options.seconds)
             viewer.wait(_END_TIMEOUT)
-        measure(watcher, node.pid, 'nobody any more', options.seconds)
+        measure(watcher, node.pid, 'no subscriber any more', options.seconds)
     rclpy.shutdown()
 
 

@@ -111,7 +111,7 @@ def compare(watcher: Watcher, seconds: float, with_browser: bool) -> None:
     measure(watcher, 'no viewer', seconds)
     with ExitStack() as stack:
         view, address = open_view(stack)
-        measure(watcher, 'a viewer that nobody visits', seconds)
+        measure(watcher, 'a viewer without visitors', seconds)
         for number in range(VISITORS):
             stack.callback(Visitor(address, f'bench{number}').close)
         measure(watcher, f'{VISITORS} visitors that do not draw', seconds)

@@ -24,7 +24,7 @@ find_python() {
 }
 
 if ! "$venv/bin/python" -m pip --version >/dev/null 2>&1; then
-    # What is no environment is somebody's, and would be cleared away.
+    # `venv --clear` would delete a folder with other files.
     if [ -d "$venv" ] && [ -n "$(ls -A "$venv")" ] && [ ! -e "$venv/pyvenv.cfg" ]; then
         echo "make env: $venv is there and no virtual environment: name another with VENV=..." >&2
         exit 2
