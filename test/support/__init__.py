@@ -12,10 +12,10 @@ ROOT = SUPPORT.parents[1]
 PACKAGES = ('msgs_spec', 'node_runtime', 'fetch_hand_sim', 'policy_node')
 
 
-def script_environment(environment: dict[str, str] | None = None) -> dict[str, str]:
-    """The environment in which a script of this folder finds this folder and the packages."""
+def script_environment() -> dict[str, str]:
+    """Return an environment in which a process finds this folder and the packages."""
     paths = os.pathsep.join(str(path) for path in (ROOT, SUPPORT.parent))
-    return dict(os.environ if environment is None else environment) | {'PYTHONPATH': paths}
+    return os.environ | {'PYTHONPATH': paths}
 
 
 def reset_peak_memory() -> None:
