@@ -141,6 +141,9 @@ def test_a_robot_rests_obeys_holds_pauses_steps_and_resets(start_process: Start)
         robot.connect('commands')
         robot.spin_until(lambda: len(robot.received['applied_command']) > 3, 'ticks')
         assert list(robot.received['applied_command'][-1].data) == [0.0] * 4
+        # A whole episode: its end would end the hold.
+        first = robot.statuses()[-1].episode
+        robot.spin_until(lambda: robot.statuses()[-1].episode > first, 'a new episode')
         robot.command(0.5, 0.0, 0.0, 1.0)
         seen = robot.received['applied_command']
         robot.spin_until(lambda: list(seen[-1].data) == [0.5, 0.0, 0.0, 1.0], 'the command')
