@@ -51,7 +51,7 @@ def actor_path(name_or_path: str | Path, others: Sequence[str] = ()) -> Path:
 
     Args:
         name_or_path: Name of a shipped actor, or a path.
-        others: Names that the caller accepts besides; only the error message lists them.
+        others: Further names that the caller accepts; only the error message lists them.
 
     Raises:
         ValueError: If no such actor or file exists. The message lists the shipped actors, or
