@@ -108,8 +108,8 @@ class RunFolder:
         """Save an evaluated actor if its success rate is the highest of the run so far.
 
         At equal success rates, the mean return decides. `counters` gets both values of the new best
-        actor. An evaluation of fewer than `evaluation_episodes` episodes has no effect. An actor that
-        cannot be written has no effect either.
+        actor. An evaluation of fewer than `evaluation_episodes` episodes has no effect. An actor
+        that cannot be written has no effect either.
         """
         rule = self.config.success_rule
         success = success_rate(outcomes, rule)
