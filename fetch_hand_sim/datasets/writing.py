@@ -41,20 +41,19 @@ def why_apart(episode: EpisodeArrays, first: EpisodeArrays) -> str:
 
 
 @contextmanager
-def alone_in(directory: Path) -> Iterator[None]:
+def alone_in(directory: Path) -> Iterator[bool]:
     """Lock a folder, created if missing, until the block ends; wait for another process's lock.
 
-    Remove the hidden folders of exports that were killed.
+    Yield whether the folder is locked. Some file systems lack locks.
     """
     directory.mkdir(parents=True, exist_ok=True)
     descriptor = os.open(directory, os.O_RDONLY | os.O_DIRECTORY)
+    is_locked = False
     try:
-        # Some file systems lack locks.
         with suppress(OSError):
             fcntl.flock(descriptor, fcntl.LOCK_EX)
-            for leftover in directory.glob(f'{_HIDDEN}*'):
-                shutil.rmtree(leftover)
-        yield
+            is_locked = True
+        yield is_locked
     finally:
         os.close(descriptor)
 
@@ -63,12 +62,17 @@ def alone_in(directory: Path) -> Iterator[None]:
 def appearing(directory: Path, names: Iterable[str]) -> Iterator[Path]:
     """Yield a hidden folder; if the block succeeds, move its entries `names` to `directory`.
 
+    Hidden folders of exports that were killed are removed first.
+
     Raises:
         ExportError: If `directory` already contains one of `names`, or the disk fails.
     """
     targets = {name: directory / name for name in names}
     try:
-        with alone_in(directory):
+        with alone_in(directory) as is_locked:
+            if is_locked:
+                for leftover in directory.glob(f'{_HIDDEN}*'):
+                    shutil.rmtree(leftover, ignore_errors=True)
             for path in targets.values():
                 if path.exists():
                     raise ExportError(f'{path} exists; nothing is overwritten')
