@@ -22,6 +22,7 @@ import numpy as np
 import rclpy
 from bench_rate import Watcher
 
+from fetch_hand_sim.commands.node_processes import start_nodes, stop_node
 from msgs_spec.tasks import TASKS, task_spec
 from msgs_spec.topics import topic
 from node_runtime.ros import keep_discovery_local
@@ -34,29 +35,13 @@ from support.visitors import DeafVisitor, Visitor  # noqa: E402
 VISITORS = 3
 # Seconds of a turn with the viewer or without, and before it until either is under way.
 _TURN, _SETTLING = 1.6, 0.4
-# Seconds from SIGTERM to SIGKILL.
-_END_TIMEOUT = 20.0
-
-
-def start(stack: ExitStack, *words: str, stdout: int | None = None) -> subprocess.Popen[str]:
-    """Starts a module of this project; it ends with the stack."""
-    process = subprocess.Popen([sys.executable, '-m', *words], cwd=ROOT, text=True, stdout=stdout)
-
-    def end() -> None:
-        process.send_signal(signal.SIGINT)
-        try:
-            process.wait(_END_TIMEOUT)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
-
-    stack.callback(end)
-    return process
 
 
 def open_view(stack: ExitStack) -> tuple[subprocess.Popen[str], str]:
     """Starts a viewer; returns its process and the address of its page."""
-    process = start(stack, 'fetch_hand_sim.view', '--no-browser', stdout=subprocess.PIPE)
+    words = [sys.executable, '-m', 'fetch_hand_sim.view', '--no-browser']
+    process = subprocess.Popen(words, text=True, stdout=subprocess.PIPE)
+    stack.callback(stop_node, process)
     assert process.stdout is not None
     for line in process.stdout:
         if found := re.search(r'http://([\w.:]+)/', line):
@@ -145,11 +130,12 @@ def main() -> None:
         with ExitStack() as stack:
             watcher = Watcher(topic(task_spec(options.task), 'joint_states'))
             # A line for every episode would bury the table.
-            quiet = ['--ros-args', '--log-level', 'warn']
-            words = [*quiet, '-p', f'task:={options.task}', '-p', f'mode:={mode}']
-            start(stack, 'fetch_hand_sim.sim_node', *words)
+            quiet = '--log-level', 'warn'
+            nodes = {'sim_node': {'task': options.task, 'mode': mode}}
             if mode == 'lockstep':
-                start(stack, 'policy_node.node', *quiet, '-p', 'policy:=resting')
+                nodes['policy_node'] = {'policy': 'resting'}
+            for process in start_nodes(nodes, sys.stderr, '', *quiet):
+                stack.callback(stop_node, process)
             watcher.wait_for_ticks()
             if mode == 'lockstep':
                 take_turns(watcher, options.seconds)
