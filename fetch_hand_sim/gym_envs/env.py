@@ -71,8 +71,9 @@ class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32
             gymnasium.error.Error: If the seed is no integer or negative.
         """
         given = self._read_options(options, np.ones(1, dtype=bool))
-        continued = self.np_random, self.np_random_seed
-        random, used = continued if seed is None else seeding.np_random(seed)
+        random, used = (
+            (self.np_random, self.np_random_seed) if seed is None else seeding.np_random(seed)
+        )
         self._physics.send()
         self.simulation.goals = self.simulation.goals.copy()
         draws_goals = self._draws_goals()

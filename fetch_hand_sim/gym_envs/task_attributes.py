@@ -84,9 +84,10 @@ class TaskAttributes:
             one_of(render_mode, self.metadata['render_modes'], 'render_mode')
         if 'num_envs' in self._batch.keys() & batch.keys():
             raise TypeError('num_envs is for fetch_hand_sim.make_vec; make returns one environment')
-        own, others = (signature(each).parameters for each in (TaskAttributes, Simulation))
+        allowed = {**signature(TaskAttributes).parameters, **signature(Simulation).parameters}
+        del allowed['batch']
         for name in batch:
-            one_of(name, [each for each in {**own, **others} if each != 'batch'], 'no argument')
+            one_of(name, list(allowed), 'no argument')
         self.simulation = Simulation(
             task,
             reward_type=reward_type,
