@@ -74,6 +74,10 @@ def test_the_default_is_allowed_and_survives_ros2_param_dump_and_load(spec):
     assert (loaded, type(loaded)) == (spec.default, type(spec.default))
 
 
+def test_a_joint_prefix_may_have_64_characters():
+    validate(SPECS['sim.joint_prefix'], 'x' * 64)
+
+
 @pytest.mark.parametrize('specs', NODES.values(), ids=NODES)
 def test_ros_declares_them_and_shows_the_ranges_that_are_checked(specs, make_node):
     """`ros2 param describe` prints them."""
