@@ -104,8 +104,8 @@ def resumed_config(
     """
     if not (folder / STATE_FILE).is_file():
         raise ValueError(
-            f'{folder / STATE_FILE} does not exist: the folder is missing or contains no run, or '
-            'one of recipe robust, which cannot be resumed'
+            f'{folder / STATE_FILE} does not exist: the folder is missing, its run has no '
+            'checkpoint, or the recipe is robust, which cannot be resumed'
         )
     stored = read_state(folder / STATE_FILE).extra['config']
     for name, chosen in (('task', task), ('recipe', recipe)):

@@ -119,7 +119,7 @@ def test_a_second_interrupt_does_not_wait_for_a_collection():
         ({'on_cycle': 3}, 'on_cycle 3; allowed: None or a function'),
         ({'output': 0}, 'output 0; allowed: the path of a folder, or None'),
         ({'resume': 'no'}, "resume 'no'; allowed: True or False"),
-        ({'resume': True}, 'contains no run, or one of recipe robust'),
+        ({'resume': True}, 'its run has no checkpoint, or the recipe is robust'),
         ({'resume': True, 'output': None}, 'resume=True needs output'),
         ({'init_from': 'nothing'}, "no actor 'nothing'"),
     ],
