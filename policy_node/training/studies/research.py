@@ -51,8 +51,9 @@ _SLIDE = {
     'actor_average': 0.9,
     'final_exploration': 1.0,
 }
-# Without the rarer updates of the actor, which `best` has for two block tasks since these studies.
-_HAND_RUN = {'evaluate_every': 64_000, 'policy_delay': 1}
+# Without the rarer updates of the actor and the smaller batches that `best` has for some tasks
+# since these studies.
+_HAND_RUN = {'evaluate_every': 64_000, 'policy_delay': 1, 'batch_size': 1024}
 HAND: dict[str, Any] = {**_LONG, **_HAND_RUN, 'total_steps': 1_000_000}
 _SCREENED = {**_HAND_RUN, 'total_steps': 400_000, 'evaluation_episodes': 128}
 # Imagined subgoals, learnt every fourth time.
