@@ -24,6 +24,7 @@ from fetch_hand_sim.episode_log import EpisodeOutcome, EpisodeRecord, read_summa
 from msgs_spec.codecs import decode_status
 from msgs_spec.parameters import LARGEST_SEED, episode_seed
 from msgs_spec.tasks import TASKS, TaskSpec, task_spec
+from msgs_spec.text import one_line
 from msgs_spec.tick import EpisodeStatus
 from msgs_spec.topics import DIAGNOSTICS, topic, topics
 from node_runtime.command_line import (
@@ -38,6 +39,7 @@ from node_runtime.command_line import (
     say,
     whole_number,
 )
+from node_runtime.diagnostics import Level
 from node_runtime.event_loop import EventLoop
 from node_runtime.node_main import StopSignals, destroy, find_place_for_logs
 from node_runtime.ros import (
@@ -63,16 +65,19 @@ class Watcher:
 
     Attributes:
         has_started: Whether the first episode has started.
+        error: First error that a node reported on `/diagnostics`; '' before.
     """
 
     def __init__(self, spec: TaskSpec) -> None:
         import rclpy
 
         self.has_started = False
+        self.error = ''
         self._spec = spec
         self._node = rclpy.create_node('demo')
         self._loop = EventLoop(self._node)
         subscribe(self._node, topic(spec, 'episode_status'), self._on_status)
+        subscribe(self._node, DIAGNOSTICS, self._on_diagnostics)
 
     def others(self) -> str:
         """Return what else is running and would disturb the demo, such as `a robot`; '' if none."""
@@ -112,6 +117,12 @@ class Watcher:
         if status.task == self._spec.name and status.phase != 'waiting':
             self.has_started = True
 
+    def _on_diagnostics(self, message: Any) -> None:
+        errors = [each for each in message.status if each.level == bytes([Level.ERROR])]
+        if errors and not self.error:
+            self.error = f'{errors[0].name.lstrip("/")}: {one_line(errors[0].message)}'
+            complain(_NAME, self.error)
+
 
 class Demo:
     """Runs a simulator node and a policy node until all episodes are logged."""
@@ -140,8 +151,8 @@ class Demo:
     def _play(self, policy: str, watcher: Watcher, stop: StopSignals) -> int:
         """Run both nodes until the episodes are logged; return 0, or after a failure 1 or 2.
 
-        After a failure, print the output of the nodes; 2 means that a node rejects its parameters.
-        `policy` is a value of `--policy`.
+        If a node ends too early, print the output of the nodes; 2 means that a node rejects its
+        parameters. `policy` is a value of `--policy`.
         """
         began = time.monotonic()
         with open_log('demo') as output:
@@ -165,7 +176,7 @@ class Demo:
                 say(f'sim_node and policy_node ended with exit codes {codes}')
                 return EXIT_USAGE if EXIT_USAGE in codes else EXIT_FAILURE
         self._print_summary(time.monotonic() - began)
-        return EXIT_SUCCESS
+        return EXIT_FAILURE if watcher.error else EXIT_SUCCESS
 
     def _sim_parameters(self) -> dict[str, object]:
         return {

@@ -101,6 +101,19 @@ def test_a_policy_that_cannot_be_loaded_is_wrong_usage_as_in_other_commands(
     assert code == 2 and 'policy_node: mine:make fails: ZeroDivisionError' in output
 
 
+def test_a_policy_that_fails_during_an_episode_is_an_error_of_the_demo(start_process, tmp_path):
+    (tmp_path / 'mine.py').write_text(
+        'import itertools\n'
+        'calls = itertools.count()\n'
+        'def make(task): return lambda observation: [0.0 / (next(calls) < 30)] * 4'
+    )
+    demo = start_process(*DEMO, '--policy=mine:make', '--trust', '--episodes=2', cwd=tmp_path)
+    code, output = finish(demo)
+    assert code == 1 and '0 of 2 episodes succeeded' in output
+    (error,) = [line for line in output.splitlines() if line.startswith('fetch_hand_sim demo: ')]
+    assert 'policy_node: no command: ' in error and 'ZeroDivisionError' in error
+
+
 @pytest.mark.parametrize(
     ('arguments', 'task'),
     [
