@@ -79,11 +79,11 @@ class EpisodeGenerator:
         """Yield the logged episodes, in order, as their files are completed.
 
         Episode i has the seed `first_seed + i`. The stamps are as if one robot ran all
-        episodes, one after the other.
+        episodes, one after the other. An error of the policy or Ctrl-C is raised after finished
+        episodes were yielded.
 
         Raises:
             EpisodeLogError: If a file cannot be written, after finished episodes were yielded.
-            KeyboardInterrupt: At Ctrl-C, after finished episodes were yielded.
         """
         with ThreadPoolExecutor(_COMPLETING_THREADS, 'episode_log') as pool:
             waiting: deque[Future[LoggedEpisode]] = deque()
@@ -96,7 +96,7 @@ class EpisodeGenerator:
                     for robot in robots:
                         waiting.append(pool.submit(_complete, self._write(robot), robot))
                 yield from _completed(waiting)
-            except (KeyboardInterrupt, EpisodeLogError):
+            except (KeyboardInterrupt, Exception):
                 while waiting:
                     with suppress(EpisodeLogError):
                         yield from _completed(waiting)

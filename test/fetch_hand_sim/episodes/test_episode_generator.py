@@ -15,6 +15,7 @@ from fetch_hand_sim.episodes.generator import EpisodeGenerator
 from fetch_hand_sim.episodes.recorder import RecordingContext
 from fetch_hand_sim.simulation import Simulation
 from msgs_spec.tasks import TASKS
+from policy_node.policies.policy import PolicyError
 
 ROBOTS = 2
 
@@ -30,15 +31,18 @@ def generator(
     return EpisodeGenerator(simulation, directory, act, RecordingContext(simulation))
 
 
-def test_ctrl_c_reports_every_finished_episode(tmp_path: Path) -> None:
+@pytest.mark.parametrize('error', [KeyboardInterrupt, PolicyError])
+def test_ctrl_c_or_a_failing_policy_reports_every_finished_episode(
+    tmp_path: Path, error: type[BaseException]
+) -> None:
     logged, asked = [], itertools.count()
 
     def act(observation: object) -> np.ndarray:
         if next(asked) == 2 * TASKS['FetchReach'].episode_ticks + 10:
-            raise KeyboardInterrupt
+            raise error
         return rest(observation)
 
-    with pytest.raises(KeyboardInterrupt):
+    with pytest.raises(error):
         for each in generator(tmp_path, act).generate(10 * ROBOTS):
             logged.append(each.path)
     assert logged == sorted(tmp_path.iterdir())
