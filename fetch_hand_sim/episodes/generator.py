@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +32,7 @@ from msgs_spec.arrays import Array
 from msgs_spec.codecs import CommandCodec
 from msgs_spec.robots import clip_command, command_from_action
 from msgs_spec.tick import Tick, TickEncoder
-from msgs_spec.topics import topic
+from msgs_spec.topics import TopicSpec, topic
 
 Act = Callable[[Observation], NDArray[Any]]
 
@@ -43,12 +44,13 @@ _COMPLETING_THREADS = 4
 class _Robot:
     """One robot of the batch in one episode.
 
-    `messages` contains stamp (ns), published messages and received command of each tick. Before a
-    command is received, None replaces it.
+    `ticks` contains stamp (ns) and published messages of each tick, `commands` the command (CDR)
+    received after each tick but the last.
     """
 
     episode: RobotEpisode
-    messages: list[tuple[int, list[Any], bytes | None]] = field(default_factory=list)
+    ticks: list[tuple[int, list[tuple[TopicSpec, bytes]]]] = field(default_factory=list)
+    commands: list[bytes] = field(default_factory=list)
 
 
 class EpisodeGenerator:
@@ -136,22 +138,21 @@ class EpisodeGenerator:
 
     def _require_room(self, robot: _Robot) -> None:
         """Raise EpisodeLogError if a file is too small for an episode with steps like the first."""
-        (_, _, command), (_, published, _) = robot.messages
-        assert command is not None
-        require_room(self._simulation.spec.episode_ticks, [data for _, data in published], command)
+        _, published = robot.ticks[1]
+        messages = [data for _, data in published]
+        require_room(self._simulation.spec.episode_ticks, messages, robot.commands[0])
 
     def _take(self, robot: _Robot, tick: Tick) -> None:
-        """Encode the messages of a tick and append them to `robot.messages`."""
+        """Encode the messages of a tick and append them to `robot.ticks`."""
         messages = self._encoder.encode(tick, latched=tick.status.phase != 'running')
-        robot.messages.append((tick.stamp_ns, messages, None))
+        robot.ticks.append((tick.stamp_ns, messages))
 
     def _receive(self, robots: Sequence[_Robot], commands: Array) -> None:
-        """Encode commands (N, action size) as CDR and add each to the last tick of its robot."""
+        """Encode commands (N, action size) as CDR and append each to `commands` of its robot."""
         for robot, command in zip(robots, commands, strict=False):
             if not robot.episode.is_finished:
-                stamp_ns, messages, _ = robot.messages[-1]
-                data = self._command_encoder.encode(stamp_ns, command)
-                robot.messages[-1] = (stamp_ns, messages, data)
+                stamp_ns, _ = robot.ticks[-1]
+                robot.commands.append(self._command_encoder.encode(stamp_ns, command))
 
     def _write(self, robot: _Robot) -> EpisodeWriter:
         status = robot.episode.status
@@ -162,7 +163,7 @@ class EpisodeGenerator:
             self._context.attachments,
         )
         try:
-            for stamp_ns, messages, command in robot.messages:
+            for (stamp_ns, messages), command in zip_longest(robot.ticks, robot.commands):
                 writer.write_tick(stamp_ns, messages)
                 if command is not None:
                     writer.write_received(self._commands, command)
@@ -170,7 +171,8 @@ class EpisodeGenerator:
             # The episode is whole, and its file would be marked as interrupted.
             writer.discard()
             raise
-        robot.messages.clear()
+        robot.ticks.clear()
+        robot.commands.clear()
         return writer
 
 
