@@ -75,7 +75,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(options: argparse.Namespace) -> int:
-    require_extra('data', *_NEEDED[options.to])
+    _require_packages(options)
     name = minari.dataset_name('logged-v0' if options.name is None else options.name)
     skipped: list[EpisodeReadError] = []
     by_task: dict[str, list[EpisodeArrays]] = {}
@@ -98,6 +98,16 @@ def _run(options: argparse.Namespace) -> int:
     for task, written in _export(options, by_task, name).items():
         say(f'{_counted(by_task[task])} of {task}: {written}')
     return EXIT_FAILURE if skipped else EXIT_SUCCESS
+
+
+def _require_packages(options: argparse.Namespace) -> None:
+    """Raise UsageError, which names what to install, if the export needs a missing package."""
+    require_extra('data', *_NEEDED[options.to])
+    if options.pictures is not None:
+        from fetch_hand_sim.films.film import find_ffmpeg
+
+        with usage_errors():
+            find_ffmpeg()
 
 
 def _why_none(path: Path, filtered: int) -> str:

@@ -86,7 +86,7 @@ def check_kind(path: Path) -> None:
     if not path.absolute().parent.is_dir():
         raise ValueError(f'{path}: {path.absolute().parent} is no directory')
     if kind == '.mp4':
-        _ffmpeg()
+        find_ffmpeg()
 
 
 def check_size(path: Path, width: int, height: int) -> None:
@@ -163,7 +163,7 @@ def _write_mp4(path: Path, pictures: Iterable[Picture], fps: float, keyframe_eve
     height, width = first.shape[:2]
     # A ratio: six digits of 500/11 are a picture off after some hours.
     rate = Fraction(fps).limit_denominator(1000)
-    command = [_ffmpeg(), '-y', '-loglevel', 'error', '-f', 'rawvideo', '-pix_fmt', 'rgb24']
+    command = [find_ffmpeg(), '-y', '-loglevel', 'error', '-f', 'rawvideo', '-pix_fmt', 'rgb24']
     command += ['-s', f'{width}x{height}', '-r', f'{rate.numerator}/{rate.denominator}']
     command += ['-i', '-', '-an']
     # H.264 in 4:2:0, which every player shows, needs even sides.
@@ -186,7 +186,8 @@ def _write_mp4(path: Path, pictures: Iterable[Picture], fps: float, keyframe_eve
         raise OSError(f'ffmpeg: {complaint or process.returncode}')
 
 
-def _ffmpeg() -> str:
+def find_ffmpeg() -> str:
+    """Return the path of ffmpeg; ValueError, which names what to install, if it is missing."""
     try:
         from imageio_ffmpeg import get_ffmpeg_exe
 
@@ -194,7 +195,9 @@ def _ffmpeg() -> str:
     except (ImportError, RuntimeError):
         found = shutil.which('ffmpeg')
     if found is None:
-        raise ValueError("mp4 needs ffmpeg: pip install 'fetch_hand_sim[film]'; or write a .gif")
+        raise ValueError(
+            ".mp4 needs ffmpeg: pip install 'fetch_hand_sim[film]'; a .gif or .webp does not"
+        )
     return found
 
 

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import json
+import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from fetch_hand_sim.commands import episodes_export
 from fetch_hand_sim.datasets.writing import why_apart
 from fetch_hand_sim.episode_log import EpisodeDirectory, load_episodes
 from fetch_hand_sim.episode_log.arrays import load_episode
+from fetch_hand_sim.films import film
 from fetch_hand_sim.films.recording import Studio, load_recordings
 from fetch_hand_sim.simulation.opengl import prepare_opengl
 from support.episode_recorder import Recorder
@@ -156,10 +159,24 @@ def test_colors_are_summed_up_as_numbers_are():
         ('parquet', '--name mine', '--name is for --to minari, not parquet'),
     ],
 )
-def test_options_that_do_not_fit_are_refused(episodes, export, tmp_path, to, options, line, capsys):
+def test_options_that_do_not_fit_are_refused(
+    episodes, export, tmp_path, to, options, line, monkeypatch, capsys
+):
+    monkeypatch.setattr(film, 'find_ffmpeg', lambda: 'not reached')
     assert export(episodes, to, tmp_path / 'out', *options.split()) == 2
     assert line in capsys.readouterr().err
     assert not list(tmp_path.rglob('*.*'))
+
+
+def test_a_missing_ffmpeg_is_reported_before_an_episode_is_read(
+    episodes, export, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.setitem(sys.modules, 'imageio_ffmpeg', None)
+    monkeypatch.setenv('PATH', '')
+    monkeypatch.setattr(episodes_export, 'read_episode', lambda path: pytest.fail('read'))
+    assert export(episodes, 'lerobot', tmp_path / 'out', '--pictures', '96x96') == 2
+    line = "export: .mp4 needs ffmpeg: pip install 'fetch_hand_sim[film]'"
+    assert line in capsys.readouterr().err
 
 
 def test_the_environment_of_a_task_without_object_is_its_goal(export, tmp_path):
