@@ -75,6 +75,9 @@ def _run(options: argparse.Namespace) -> int:
         _render(options, is_picture)
     except ValueError as error:
         raise UsageError(str(error)) from None
+    except BrokenPipeError:
+        # `run_command` returns 141 for a closed output.
+        raise
     except (RuntimeError, OSError) as error:
         raise CommandError(str(error)) from None
     say(f'{options.out}: {options.out.stat().st_size / 1024:.0f} KiB')

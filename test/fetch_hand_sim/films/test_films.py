@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import errno
 import io
+import os
 import re
 import shutil
 import subprocess
@@ -309,6 +310,16 @@ def test_without_opengl_there_is_one_line(folder, tmp_path, monkeypatch, capsys)
     monkeypatch.setattr(Studio, '__init__', refuse)
     assert episodes_film([str(folder), '--out', str(tmp_path / 'x.png')]) == 1
     assert capsys.readouterr().err == 'fetch_hand_sim episodes film: rendering needs OpenGL\n'
+
+
+def test_a_closed_output_ends_the_command_with_its_code(folder, tmp_path):
+    reader, writer = os.pipe()
+    os.close(reader)
+    command = [sys.executable, '-m', 'fetch_hand_sim', 'episodes', 'film', folder]
+    command += ['--out', tmp_path / 'x.png']
+    done = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, text=True)
+    os.close(writer)
+    assert (done.returncode, done.stderr) == (141, '')
 
 
 def test_a_film_in_memory_gives_back_every_picture_and_plays_in_a_notebook(tmp_path):
