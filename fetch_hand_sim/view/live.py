@@ -162,7 +162,7 @@ class LiveRobot:
             self._update_facts(tick=status.tick, episode_return=status.episode_return)
             self._notice_other_robot()
             self._requests.begin_episode()
-        self._update_facts(phase=status.phase, episode=status.episode, seed=status.seed)
+        self._update_facts(episode=status.episode, seed=status.seed)
 
     def _on_tick(self, tick: SeenTick) -> None:
         history, facts = self._history, self._facts
@@ -179,9 +179,7 @@ class LiveRobot:
             # `episode_status` is published only when an episode begins or ends.
             count = facts.tick + int(tick.command is not None)
             total = facts.episode_return + (tick.reward or 0.0)
-        is_running = tick.status is None and tick.reward is not None
-        phase = 'running' if is_running else self._facts.phase
-        self._update_facts(phase=phase, tick=count, episode_return=total)
+        self._update_facts(tick=count, episode_return=total)
 
     def _on_policy(self, message: Any) -> None:
         self._policy = decode_status(message).get('commander', '')

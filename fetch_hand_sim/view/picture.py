@@ -21,7 +21,6 @@ class Facts:
 
     Attributes:
         source: `live` for a running robot, `file` for an episode file.
-        phase: Phase of the episode: `waiting`, `reset`, `running` or `finished`.
         tick: Steps of the episode so far.
         ticks: Steps of a whole episode.
         commander: Names of the nodes that command the robot.
@@ -40,7 +39,6 @@ class Facts:
     """
 
     source: str = 'live'
-    phase: str = 'waiting'
     episode: int = 0
     seed: int = 0
     tick: int = 0

@@ -200,7 +200,6 @@ class Player:
         arrays = self._recording.arrays
         return Facts(
             source='file',
-            phase='finished' if index == len(arrays) else 'running',
             episode=arrays.record.episode,
             seed=arrays.record.seed,
             tick=index,

@@ -212,7 +212,7 @@ def test_a_replay_of_any_name_is_told_from_a_robot_and_paused(
     start_process(*VIEW_REPLAY, *ros_args(path=path, loop=True, rate=0.8), *renamed)
     with client(REACH, namespace='left') as connection:
         follower = Follower(connection)
-        follower.until(lambda p: p.facts.rate > 1.0 and p.facts.phase == 'running', 'replay')
+        follower.until(lambda p: p.facts.rate > 1.0 and p.facts.tick > 0, 'replay')
         facts = follower.picture.facts
         assert facts.commander == 'a replay (/left/player)'
         assert not facts.takes_actions
