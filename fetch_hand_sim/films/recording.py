@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from fetch_hand_sim.episode_log import EpisodeReadError
-from fetch_hand_sim.episode_log.arrays import EpisodeArrays, load_episode, stamped_vectors
+from fetch_hand_sim.episode_log import Episode, EpisodeReadError
+from fetch_hand_sim.episode_log.arrays import EpisodeArrays, arrays_of, stamped_vectors
 from fetch_hand_sim.episode_log.files import expand_episodes, holds_no_episode, read_each
 from fetch_hand_sim.episode_log.reader import one_line_errors, read_episode
 from fetch_hand_sim.simulation.rendering import SceneRenderer
@@ -43,13 +43,17 @@ class Recording:
 
 def load_recording(path: Path) -> Recording:
     """Read a bag directory or MCAP file as frames; EpisodeReadError if it is no valid episode."""
-    return recording_of(load_episode(path))
+    file = read_episode(path)
+    return _recording(file, arrays_of(file))
 
 
 def recording_of(arrays: EpisodeArrays) -> Recording:
     """Return a loaded episode as frames; joint and object positions come from its file."""
-    task, stamps = arrays.record.task, arrays.stamps
-    file, poses = read_episode(arrays.path), None
+    return _recording(read_episode(arrays.path), arrays)
+
+
+def _recording(file: Episode, arrays: EpisodeArrays) -> Recording:
+    task, stamps, poses = arrays.record.task, arrays.stamps, None
     with one_line_errors(file.path):
         joints = stamped_vectors(file, task, 'joint_states', stamps)[:, : len(task.robot.joints)]
         if task.has_object:

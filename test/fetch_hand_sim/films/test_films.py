@@ -19,7 +19,8 @@ from PIL import Image
 
 import fetch_hand_sim
 from fetch_hand_sim.commands.episodes_film import main as episodes_film
-from fetch_hand_sim.episode_log import EpisodeDirectory, EpisodeReadError, load_episodes
+from fetch_hand_sim.episode_log import EpisodeDirectory, EpisodeReadError, load_episodes, reader
+from fetch_hand_sim.episode_log.indexes import parse_file
 from fetch_hand_sim.films.film import Roll, check_kind, check_size, write_film, write_picture
 from fetch_hand_sim.films.playing import Film, film_episode
 from fetch_hand_sim.films.recording import Studio, grid, load_recordings, sheets
@@ -194,6 +195,12 @@ def test_a_sheet_that_a_file_cannot_hold_is_one_line_before_drawing(
     check_size(out, largest, min(largest, 2**28 // largest))
     with pytest.raises(ValueError, match='allowed: 268435456 in all'):
         check_size(out.with_suffix('.png'), 2**14, 2**14 + 1)
+
+
+def test_an_episode_is_read_once(folder, monkeypatch):
+    parsed = []
+    monkeypatch.setattr(reader, 'parse_file', lambda data: parsed.append(1) or parse_file(data))
+    assert len(load_recordings(folder, 2)) == len(parsed) == 2
 
 
 @pytest.mark.usefixtures('opengl')
