@@ -24,7 +24,7 @@ from fetch_hand_sim.gym_envs.gymnasium_robotics_parts import (
     mujoco_renderer,
     mujoco_utils,
 )
-from fetch_hand_sim.gym_envs.pictures import RENDER_MODES, Image
+from fetch_hand_sim.gym_envs.pictures import Image
 from fetch_hand_sim.gym_envs.vector_env import FetchHandVectorEnv
 from fetch_hand_sim.simulation import Observation
 from fetch_hand_sim.simulation.models import asset_path, find
@@ -88,7 +88,6 @@ class RobotEnv(FetchHandEnv, GoalEnv):
         fullpath: The MJCF file.
     """
 
-    metadata = {'render_modes': RENDER_MODES, 'render_fps': 25}  # noqa: RUF012
     # Hooks of Gymnasium-Robotics.
     _uncalled = (
         *('_env_setup', '_initialize_simulation', '_mujoco_step'),

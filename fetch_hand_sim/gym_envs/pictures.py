@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from fetch_hand_sim.simulation import Simulation
 from fetch_hand_sim.simulation.opengl import start_glfw
 from fetch_hand_sim.simulation.rendering import (
-    HEIGHT,
-    WIDTH,
     SceneRenderer,
     check_size,
     make_camera,
@@ -40,9 +38,9 @@ class Pictures:
     def __init__(
         self,
         simulation: Simulation,
-        width: int = WIDTH,
-        height: int = HEIGHT,
-        camera: Mapping[str, Any] | None = None,
+        width: int,
+        height: int,
+        camera: Mapping[str, Any] | None,
     ) -> None:
         check_size(width, height)
         set_attributes(mujoco.MjvCamera(), {} if camera is None else camera, simulation.model)

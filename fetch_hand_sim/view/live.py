@@ -52,7 +52,6 @@ class LiveRobot:
     """
 
     def __init__(self, node: Node, may_command: bool) -> None:
-        self._may_command = may_command
         self._node = node
         self._sim_name = full_name(node.get_namespace(), 'sim_node')
         self._facts = Facts(may_command=may_command)
@@ -107,7 +106,7 @@ class LiveRobot:
 
     def perform(self, request: Request) -> None:
         """Perform a request, unless the page may only watch."""
-        if not self._may_command:
+        if not self._facts.may_command:
             self._update_facts(notice=ONLY_WATCHED)
             return
         if isinstance(request, SetCommand):

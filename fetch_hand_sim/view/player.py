@@ -93,8 +93,7 @@ class Player:
     def index(self) -> int:
         """The index of the frame at the playhead."""
         times = self._recording.times
-        last = int(np.searchsorted(times, self._position + 1e-9, side='right')) - 1
-        return min(max(last, 0), len(times) - 1)
+        return int(np.searchsorted(times, self._position + 1e-9, side='right')) - 1
 
     def picture(self) -> Picture | None:
         """Move the playhead to the present time; return a picture, or None if it is unchanged."""
