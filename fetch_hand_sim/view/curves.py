@@ -32,8 +32,11 @@ class Curves:
         self._fingers = [
             index for index, name in enumerate(robot.joints) if 'gripper_finger' in name
         ]
+        # Another robot may have a gripper without such fingers.
         self._grippers = [
-            index for index, part in enumerate(robot.command) if part.name == 'gripper'
+            index
+            for index, part in enumerate(robot.command)
+            if part.name == 'gripper' and self._fingers
         ]
         self._commanded = [
             robot.joints.index(part.name) if part.name in robot.joints else None

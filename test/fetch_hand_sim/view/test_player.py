@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -25,6 +26,7 @@ from fetch_hand_sim.view.requests import (
     SetSpeed,
     StepOnce,
 )
+from msgs_spec.robots import FETCH
 from msgs_spec.tasks import TASKS
 from support.episode_recorder import Recorder
 from support.tasks import each_task
@@ -194,6 +196,15 @@ def test_fingers_are_comparable_with_the_command_of_the_gripper():
     assert names == [['command, from where it is']] * 3 + [['command', 'fingers (1: 0.1 m apart)']]
     opening = command_curves(spec.robot.command[3], graphs, 3)['fingers (1: 0.1 m apart)'].values
     assert opening[9] == pytest.approx(1.0, abs=0.1) and opening[-1] == pytest.approx(-1.0, abs=0.1)
+
+
+@pytest.mark.filterwarnings('error')
+def test_a_gripper_of_another_robot_has_no_position():
+    joints = tuple(name.replace('gripper_finger', 'jaw') for name in FETCH.joints)
+    spec = replace(TASKS['FetchReach'], robot=replace(FETCH, joints=joints))
+    curves, goal = Curves(GoalMetric(spec)), np.zeros(3)
+    curves.add(0.0, Frame(np.zeros(len(joints)), goal, goal, None, False), 0.0, np.zeros(4))
+    assert np.isnan(curves.graphs().positions.values).all()
 
 
 def test_a_rotation_is_at_most_180_degrees():
