@@ -22,11 +22,8 @@ from fetch_hand_sim.episode_log.files import EpisodeExistsError, EpisodeLogError
 from fetch_hand_sim.episode_log.records import (
     MAX_ATTACHMENT_BYTES,
     MAX_CHUNKS,
-    MAX_MESSAGES,
     MAX_RECEIVED_BYTES,
     MAX_RECEIVED_MESSAGES,
-    MAX_UNPACKED_BYTES,
-    MESSAGE,
 )
 from msgs_spec.schemas import MAX_MESSAGE_BYTES
 from msgs_spec.topics import TopicSpec
@@ -71,24 +68,6 @@ class ReceivedAllowance:
         self._messages[topic] += 1
         self._bytes[topic] += size
         return True
-
-
-def require_room(ticks: int, published: Sequence[bytes], command: bytes) -> None:
-    """Raise EpisodeLogError if an episode of `ticks` steps is too long for a file.
-
-    `published` are the messages of a step between the first and the last; `command` is the message
-    that each step receives.
-    """
-    received = min(ticks, MAX_RECEIVED_MESSAGES, MAX_RECEIVED_BYTES // len(command))
-    # The reset lacks reward and applied command; reset and last step have a status.
-    messages = (ticks + 1) * len(published) + received
-    size = ticks * sum(map(len, published)) + received * len(command) + messages * MESSAGE.itemsize
-    if messages > MAX_MESSAGES or size > MAX_UNPACKED_BYTES:
-        raise EpisodeLogError(
-            f'an episode of {ticks} steps has {messages} messages, {size / 2**20:.3g} MiB; allowed '
-            f'in a file: {MAX_MESSAGES} messages, {MAX_UNPACKED_BYTES / 2**20:g} MiB; reduce '
-            'episode_ticks of the task'
-        )
 
 
 class EpisodeWriter:

@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 
 from fetch_hand_sim.episode_log import EpisodeDirectory, EpisodeLogError, EpisodeWriter
 from fetch_hand_sim.episode_log.metadata import DIVERGED
-from fetch_hand_sim.episode_log.writer import require_room
 from fetch_hand_sim.episodes.recorder import (
     LoggedEpisode,
     RecordingContext,
@@ -86,8 +85,7 @@ class EpisodeGenerator:
         episodes were yielded.
 
         Raises:
-            EpisodeLogError: If a file cannot be written, after finished episodes were yielded; or
-                at the first step, if an episode is too long for a file.
+            EpisodeLogError: If a file cannot be written, after finished episodes were yielded.
         """
         with ThreadPoolExecutor(_COMPLETING_THREADS, 'episode_log') as pool:
             waiting: deque[Future[LoggedEpisode]] = deque()
@@ -120,7 +118,7 @@ class EpisodeGenerator:
         sensed = sense(simulation)
         for index, robot in enumerate(robots):
             self._take(robot, robot.episode.start(sensed, index))
-        for step in range(simulation.spec.episode_ticks):
+        for _ in range(simulation.spec.episode_ticks):
             observation = simulation.observe_from(sensed.readings)
             actions = self._act({**observation, 'achieved_goal': sensed.achieved})
             commands = np.asarray(command_from_action(robot_spec, actions), dtype=np.float64)
@@ -133,14 +131,6 @@ class EpisodeGenerator:
                     has_diverged = bool(diverged[index])
                     tick = robot.episode.step(sensed, index, applied[index], has_diverged)
                     self._take(robot, tick)
-            if step == 0 and not robots[0].episode.is_finished:
-                self._require_room(robots[0])
-
-    def _require_room(self, robot: _Robot) -> None:
-        """Raise EpisodeLogError if a file is too small for an episode with steps like the first."""
-        _, published = robot.ticks[1]
-        messages = [data for _, data in published]
-        require_room(self._simulation.spec.episode_ticks, messages, robot.commands[0])
 
     def _take(self, robot: _Robot, tick: Tick) -> None:
         """Encode the messages of a tick and append them to `robot.ticks`."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -85,37 +84,6 @@ def test_a_full_disk_reports_every_finished_episode(
             logged.append(each.path)
     assert len(logged) == ROBOTS - 1
     assert {*logged} == {path for path in tmp_path.iterdir() if path.name[0] != '.'}
-
-
-@pytest.mark.parametrize(
-    ('ticks', 'steps', 'error', 'line'),
-    [
-        # 4,999 steps have 49,999 messages.
-        (4999, 2, KeyboardInterrupt, None),
-        (5000, 1, EpisodeLogError, '5000 steps has 50009 messages, .*; allowed .*: 50000'),
-    ],
-)
-def test_an_episode_that_is_too_long_for_a_file_is_rejected_at_its_first_step(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    ticks: int,
-    steps: int,
-    error: type[BaseException],
-    line: str | None,
-) -> None:
-    task = replace(TASKS['FetchReach'], episode_ticks=ticks)
-    monkeypatch.setitem(TASKS, 'FetchReach', task)
-    asked = []
-
-    def act(observation: object) -> np.ndarray:
-        asked.append(observation)
-        if len(asked) > 1:
-            raise KeyboardInterrupt
-        return rest(observation)
-
-    with pytest.raises(error, match=line):
-        list(generator(tmp_path, act).generate(ROBOTS))
-    assert len(asked) == steps and list(tmp_path.iterdir()) == []
 
 
 def test_an_episode_that_mujoco_gave_up_is_no_whole_one(tmp_path: Path) -> None:
