@@ -153,36 +153,38 @@ class RunFolder:
     def save_when_due(
         self, learner: ActorCritic, experience: Experience, counters: Counters
     ) -> None:
-        """Call `save` when the last checkpoint is `checkpoint_seconds` old; add replay every 900 s.
+        """Save as `save` does when the last checkpoint is `checkpoint_seconds` old.
 
-        If a file cannot be written, for example on a full disk, only warn.
+        The episodes are written only every 900 s. If a file cannot be written, for example on a
+        full disk, only warn.
         """
         now = time.monotonic()
         if now - self._last_checkpoint < self.config.checkpoint_seconds:
             return
         with disk_warning('no checkpoint, the one before is kept'):
-            due = now - self._last_replay >= REPLAY_SECONDS
-            self.save(learner, experience, counters, with_replay=due)
+            self._save_state(learner, experience, counters)
+        if now - self._last_replay >= REPLAY_SECONDS:
+            with disk_warning('no newer replay for --resume'):
+                self._save_replay(experience)
 
-    def save(
-        self,
-        learner: ActorCritic,
-        experience: Experience,
-        counters: Counters,
-        with_replay: bool = True,
-    ) -> None:
-        """Write the newest episodes and, on the first worker, the actor and the training state.
+    def save(self, learner: ActorCritic, experience: Experience, counters: Counters) -> None:
+        """Write actor and training state, on the first worker, then the newest episodes.
 
-        Without `with_replay`, the earlier file of episodes stays.
+        A disk that is too full for the episodes still gets actor and training state.
 
         Raises:
             OSError: If a file cannot be written; its earlier version stays.
         """
+        self._save_state(learner, experience, counters)
+        self._save_replay(experience)
+
+    def _save_replay(self, experience: Experience) -> None:
+        self._last_replay = time.monotonic()
+        kept = self.workers.share(self.config.kept_transitions)
+        save_replay(self.replay_file(), experience.replay, kept)
+
+    def _save_state(self, learner: ActorCritic, experience: Experience, counters: Counters) -> None:
         self._last_checkpoint = time.monotonic()
-        if with_replay:
-            kept = self.workers.share(self.config.kept_transitions)
-            save_replay(self.replay_file(), experience.replay, kept)
-            self._last_replay = self._last_checkpoint
         if self.workers.is_first:
             self.save_actor(LATEST_FILE, learner.evaluation_actor(), counters.env_steps)
             extra = {'config': to_flat(self.config), 'command': self.command}

@@ -288,6 +288,20 @@ def test_a_full_disk_leaves_no_partial_file_and_does_not_end_a_run(tmp_path, cap
         assert counters_of(tmp_path)['best_success'] == -1
 
 
+def test_a_disk_that_is_too_full_for_the_replay_keeps_the_training_state(
+    tmp_path, monkeypatch, capsys
+):
+    """A replay of 2,000 steps needs 139 kB, a training state 35 kB."""
+    monkeypatch.setattr('policy_node.training.runs.run_folder.REPLAY_SECONDS', 0.0)
+    trainer = trainer_of(tmp_path, total_steps=2_000, checkpoint_seconds=0)
+    with files_at_most(80_000), pytest.raises(OSError, match='replay'):
+        trainer.train()
+    said = capsys.readouterr().err
+    assert 'no newer replay for --resume: ' in said and 'no checkpoint' not in said
+    assert counters_of(tmp_path)['updates'] == trainer.counters.updates == 20
+    assert checkpoint.read_info(tmp_path / 'latest.safetensors').env_steps == 2_000
+
+
 def row(steps, success):
     values = dict.fromkeys(COLUMNS, 1.0)
     return {**values, 'env_steps': steps, 'eval_success': success, 'train_success': 0.25}
