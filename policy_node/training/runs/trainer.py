@@ -206,8 +206,8 @@ class Trainer(BaseTrainer):
     def resume(self, path: Path) -> None:
         """Continue from the training state in the file `path` and the replay beside it.
 
-        If the replay is missing, the run first refills it with new episodes, which do not count as
-        environment steps.
+        If the replay is missing or has too few episodes, the run first refills it with new
+        episodes, which do not count as environment steps.
 
         Raises:
             ValueError: If the file does not fit the configuration.
@@ -232,9 +232,6 @@ class Trainer(BaseTrainer):
         except ValueError as error:
             if file.exists():
                 complain(NAME, error)
-            complain(
-                NAME, f'{self._steps_to_refill:,} steps fill the replay before learning continues'
-            )
 
     def _let_critic_learn_first(self) -> None:
         """Let only critics learn in the first `CRITIC_FIRST` updates if `init_from` lacks a critic.
@@ -339,6 +336,9 @@ class Trainer(BaseTrainer):
 
         Refilling collects episodes without learning. Return None if the run is stopped meanwhile.
         """
+        missing = self._steps_to_refill - self.experience.transitions
+        if missing > 0:
+            complain(NAME, f'{missing:,} steps fill the replay before learning continues')
         while True:
             actor, _ = self._prepare_collection(may_evaluate=False)
             collected = self._finished(executor.submit(self._collect, actor, None))

@@ -72,6 +72,12 @@ def test_a_run_without_its_replay_fills_it_up_before_it_goes_on(tmp_path, capsys
     assert '800 steps fill the replay' in said
 
 
+def test_a_run_that_kept_a_part_of_its_replay_reports_the_steps_that_fill_it(tmp_path, capsys):
+    trained(tmp_path, total_steps=800, kept_transitions=300)
+    resumed(tmp_path, total_steps=1_200).train()
+    assert capsys.readouterr().err.count('500 steps fill the replay') == 1
+
+
 @pytest.mark.release
 @pytest.mark.parametrize('damaged', [True, False])
 def test_a_replay_that_is_no_multiple_of_an_episode_is_full_with_whole_ones(tmp_path, damaged):
