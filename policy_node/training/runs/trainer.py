@@ -323,7 +323,9 @@ class Trainer(BaseTrainer):
         if self.config.algorithm == 'ppo' or not metric.has_own_reward:
             return
         achieved = episodes.achieved_goal[:, -1].astype(np.float64)
-        highest = metric.reward(achieved, episodes.desired_goal.astype(np.float64)).max()
+        rewards = metric.reward(achieved, episodes.desired_goal.astype(np.float64))
+        # Without episodes there are no rewards.
+        highest = rewards.max(initial=0.0)
         if highest > 0.0 and self.workers.is_first:
             complain(
                 NAME,
