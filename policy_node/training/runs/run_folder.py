@@ -85,7 +85,7 @@ class RunFolder:
     """Writes the actors, the training state and the replay of a run on one worker.
 
     Attributes:
-        workers: Rank of this worker. Only the first worker writes actors and the training state.
+        workers: This worker. Only the first worker writes actors and the training state.
         command: Command line or call that started the run, for the record.
         init_from: Origin of the initial networks; empty if they were random. The trainer sets it.
     """
@@ -109,7 +109,7 @@ class RunFolder:
 
         At equal success rates, the mean return decides. `counters` gets both values of the new best
         actor. An evaluation of fewer than `evaluation_episodes` episodes has no effect. An actor
-        that cannot be written has no effect either.
+        that cannot be written has no effect either. Only the first worker evaluates actors.
         """
         rule = self.config.success_rule
         success = success_rate(outcomes, rule)
@@ -118,10 +118,9 @@ class RunFolder:
         if not is_better or len(outcomes) < self.config.evaluation_episodes:
             return
         with disk_warning('the best actor is not written, the one before is kept'):
-            if self.workers.is_first:
-                measured = {'last_step': success, 'episodes': len(outcomes), 'rule': rule}
-                measured |= {'mean_return': mean_return, **diagnose(outcomes)}
-                self.save_actor(BEST_FILE, actor, counters.env_steps, measured)
+            measured = {'last_step': success, 'episodes': len(outcomes), 'rule': rule}
+            measured |= {'mean_return': mean_return, **diagnose(outcomes)}
+            self.save_actor(BEST_FILE, actor, counters.env_steps, measured)
             counters.best_success, counters.best_return = success, mean_return
 
     def read_best(self, counters: Counters) -> None:

@@ -401,8 +401,7 @@ class Trainer(BaseTrainer):
     def _store(self, collected: Collected) -> None:
         """Add collected episodes to the replay, the counters and the normalizers."""
         episodes = collected.episodes
-        if len(episodes):
-            self.experience.replay.add(episodes)
+        self.experience.replay.add(episodes)
         count = self.workers.sum(torch.tensor([len(episodes)])).item()
         self.counters.episodes += int(count)
         self.counters.env_steps += int(count) * self.spec.episode_ticks
