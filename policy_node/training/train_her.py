@@ -36,8 +36,6 @@ if TYPE_CHECKING:
 _NAME = 'fetch_hand_sim train'
 # Fields that choose the recipe.
 _OWN_OPTIONS = ('task', 'recipe')
-# Exit code after a signal: 128 + its number.
-EXIT_SIGNAL = 128
 
 
 def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
@@ -112,8 +110,7 @@ def _run(options: argparse.Namespace, command: str) -> int:
 
     try:
         config = config_from_arguments(options)
-        output = options.resume or options.output
-        output = output or default_folder(config)
+        output = options.resume or options.output or default_folder(config)
         experience = _read_experience(config, options.from_episodes)
         resume = options.resume is not None
         ending = train_run(config, output, resume=resume, command=command, experience=experience)
@@ -128,7 +125,7 @@ def _run(options: argparse.Namespace, command: str) -> int:
             f'{ending.reason}: {counters.env_steps:,} steps, {counters.updates:,} updates, '
             f'{counters.seconds:.0f} s, best success {best}; output in {output}'
         )
-    return EXIT_SIGNAL + ending.signal if ending.signal else EXIT_SUCCESS
+    return 128 + ending.signal if ending.signal else EXIT_SUCCESS
 
 
 def _read_experience(config: TrainConfig, directory: Path | None) -> Episodes | None:

@@ -16,9 +16,6 @@ from policy_node.training.experience.replay import Transitions
 from policy_node.training.learners.actor_critic import ActorCritic, Losses
 from policy_node.training.machine import Workers, uses_bfloat16
 
-# Fields of `Transitions` that every batch has.
-_ALWAYS = ('observation', 'next_observation', 'goal', 'action', 'reward', 'discount')
-
 
 @dataclass(frozen=True, slots=True)
 class TensorBatch:
@@ -155,13 +152,12 @@ class DDPG(ActorCritic):
 
     def tensors(self, batch: Transitions) -> TensorBatch:
         """Convert a batch to tensors; compute network inputs before and after each transition."""
-        observation, next_observation, goal, action, reward, discount = (
-            self.tensor(getattr(batch, name)) for name in _ALWAYS
+        values = {name: self.tensor(getattr(batch, name)) for name in Transitions.__slots__}
+        return TensorBatch(
+            **values,
+            features=self.actor.features(values['observation'], values['goal']),
+            next_features=self.actor.features(values['next_observation'], values['goal']),
         )
-        features = self.actor.features(observation, goal)
-        next_features = self.actor.features(next_observation, goal)
-        states = observation, next_observation, goal, features, next_features
-        return TensorBatch(*states, action, reward, discount)
 
     def targets(self, reward: Tensor, discount: Tensor, next_features: Tensor) -> Tensor:
         """Return the targets of the critic, (batch,), from the target networks."""

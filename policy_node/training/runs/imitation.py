@@ -148,7 +148,8 @@ class ImitationTrainer(BaseTrainer):
     def _collect(self) -> float:
         """Run the imitating policy for an episode in each simulation; return its success rate.
 
-        The inputs and labels (imitated actions) of undiverged episodes are stored.
+        An episode whose simulation diverged counts as a failure, as in an evaluation. The inputs
+        and labels (imitated actions) of the other episodes are stored.
         """
         count = self.config.num_envs
         cycle = self.counters.episodes // count
@@ -182,7 +183,7 @@ class ImitationTrainer(BaseTrainer):
             self._answers.add(*(torch.stack(part)[:, rows].flatten(0, 1) for part in parts))
         self.counters.env_steps += count * ticks
         self.counters.episodes += count
-        return float(result.success.mean())
+        return float((result.success & ~diverged).mean())
 
     def _features(self, observation: Array, past: Array32, goal: Tensor) -> Tensor:
         seen = np.concatenate([observation, past], axis=-1)

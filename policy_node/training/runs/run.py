@@ -274,7 +274,9 @@ def _prepare_folder(trainer: AnyTrainer, resume: bool) -> None:
         if note := idle_note(trainer.config, first):
             complain(NAME, note)
     precision, device = trainer.config.precision, choose_device(trainer.config.device)
-    if uses_bfloat16(precision, device) and not uses_bfloat16('auto', device):
+    # Other algorithms use float32.
+    is_used = trainer.config.algorithm == 'ddpg' and uses_bfloat16(precision, device)
+    if is_used and not uses_bfloat16('auto', device):
         # Measured on a CPU with AVX2: 50 times longer for 1024 x 256 times 256 x 256.
         note = 'this processor emulates it and learns many times slower; use precision=float32'
         complain(NAME, f'precision {precision}: {note}')

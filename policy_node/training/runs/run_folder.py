@@ -85,7 +85,7 @@ class RunFolder:
     """Writes the actors, the training state and the replay of a run on one worker.
 
     Attributes:
-        workers: Rank of this worker. Only the first worker writes actors and the training state.
+        workers: This worker. Only the first worker writes actors and the training state.
         command: Command line or call that started the run, for the record.
         init_from: Origin of the initial networks; empty if they were random. The trainer sets it.
     """
@@ -109,7 +109,7 @@ class RunFolder:
 
         At equal success rates, the mean return decides. `counters` gets both values of the new best
         actor. An evaluation of fewer than `evaluation_episodes` episodes has no effect. An actor
-        that cannot be written has no effect either.
+        that cannot be written has no effect either. Only the first worker evaluates actors.
         """
         rule = self.config.success_rule
         success = success_rate(outcomes, rule)
@@ -118,10 +118,9 @@ class RunFolder:
         if not is_better or len(outcomes) < self.config.evaluation_episodes:
             return
         with disk_warning('the best actor is not written, the one before is kept'):
-            if self.workers.is_first:
-                measured = {'last_step': success, 'episodes': len(outcomes), 'rule': rule}
-                measured |= {'mean_return': mean_return, **diagnose(outcomes)}
-                self.save_actor(BEST_FILE, actor, counters.env_steps, measured)
+            measured = {'last_step': success, 'episodes': len(outcomes), 'rule': rule}
+            measured |= {'mean_return': mean_return, **diagnose(outcomes)}
+            self.save_actor(BEST_FILE, actor, counters.env_steps, measured)
             counters.best_success, counters.best_return = success, mean_return
 
     def read_best(self, counters: Counters) -> None:
@@ -153,36 +152,38 @@ class RunFolder:
     def save_when_due(
         self, learner: ActorCritic, experience: Experience, counters: Counters
     ) -> None:
-        """Call `save` when the last checkpoint is `checkpoint_seconds` old; add replay every 900 s.
+        """Save as `save` does when the last checkpoint is `checkpoint_seconds` old.
 
-        If a file cannot be written, for example on a full disk, only warn.
+        The episodes are written only every 900 s. If a file cannot be written, for example on a
+        full disk, only warn.
         """
         now = time.monotonic()
         if now - self._last_checkpoint < self.config.checkpoint_seconds:
             return
         with disk_warning('no checkpoint, the one before is kept'):
-            due = now - self._last_replay >= REPLAY_SECONDS
-            self.save(learner, experience, counters, with_replay=due)
+            self._save_state(learner, experience, counters)
+        if now - self._last_replay >= REPLAY_SECONDS:
+            with disk_warning('no newer replay for --resume'):
+                self._save_replay(experience)
 
-    def save(
-        self,
-        learner: ActorCritic,
-        experience: Experience,
-        counters: Counters,
-        with_replay: bool = True,
-    ) -> None:
-        """Write the newest episodes and, on the first worker, the actor and the training state.
+    def save(self, learner: ActorCritic, experience: Experience, counters: Counters) -> None:
+        """Write actor and training state, on the first worker, then the newest episodes.
 
-        Without `with_replay`, the earlier file of episodes stays.
+        A disk that is too full for the episodes still gets actor and training state.
 
         Raises:
             OSError: If a file cannot be written; its earlier version stays.
         """
+        self._save_state(learner, experience, counters)
+        self._save_replay(experience)
+
+    def _save_replay(self, experience: Experience) -> None:
+        self._last_replay = time.monotonic()
+        kept = self.workers.share(self.config.kept_transitions)
+        save_replay(self.replay_file(), experience.replay, kept)
+
+    def _save_state(self, learner: ActorCritic, experience: Experience, counters: Counters) -> None:
         self._last_checkpoint = time.monotonic()
-        if with_replay:
-            kept = self.workers.share(self.config.kept_transitions)
-            save_replay(self.replay_file(), experience.replay, kept)
-            self._last_replay = self._last_checkpoint
         if self.workers.is_first:
             self.save_actor(LATEST_FILE, learner.evaluation_actor(), counters.env_steps)
             extra = {'config': to_flat(self.config), 'command': self.command}

@@ -138,7 +138,7 @@ class RunLog:
             self._last_plain = time.monotonic()
             print(line, file=sys.stderr, flush=True)
 
-    def _remaining(self, row: dict[str, float | None]) -> str:
+    def _remaining(self, row: Row) -> str:
         speed = row['steps_per_second'] or 0
         if speed <= 0:
             return '-'

@@ -206,8 +206,8 @@ class Trainer(BaseTrainer):
     def resume(self, path: Path) -> None:
         """Continue from the training state in the file `path` and the replay beside it.
 
-        If the replay is missing, the run first refills it with new episodes, which do not count as
-        environment steps.
+        If the replay is missing or has too few episodes, the run first refills it with new
+        episodes, which do not count as environment steps.
 
         Raises:
             ValueError: If the file does not fit the configuration.
@@ -232,9 +232,6 @@ class Trainer(BaseTrainer):
         except ValueError as error:
             if file.exists():
                 complain(NAME, error)
-            complain(
-                NAME, f'{self._steps_to_refill:,} steps fill the replay before learning continues'
-            )
 
     def _let_critic_learn_first(self) -> None:
         """Let only critics learn in the first `CRITIC_FIRST` updates if `init_from` lacks a critic.
@@ -326,7 +323,9 @@ class Trainer(BaseTrainer):
         if self.config.algorithm == 'ppo' or not metric.has_own_reward:
             return
         achieved = episodes.achieved_goal[:, -1].astype(np.float64)
-        highest = metric.reward(achieved, episodes.desired_goal.astype(np.float64)).max()
+        rewards = metric.reward(achieved, episodes.desired_goal.astype(np.float64))
+        # Without episodes there are no rewards.
+        highest = rewards.max(initial=0.0)
         if highest > 0.0 and self.workers.is_first:
             complain(
                 NAME,
@@ -339,6 +338,9 @@ class Trainer(BaseTrainer):
 
         Refilling collects episodes without learning. Return None if the run is stopped meanwhile.
         """
+        missing = self._steps_to_refill - self.experience.transitions
+        if missing > 0:
+            complain(NAME, f'{missing:,} steps fill the replay before learning continues')
         while True:
             actor, _ = self._prepare_collection(may_evaluate=False)
             collected = self._finished(executor.submit(self._collect, actor, None))
@@ -399,8 +401,7 @@ class Trainer(BaseTrainer):
     def _store(self, collected: Collected) -> None:
         """Add collected episodes to the replay, the counters and the normalizers."""
         episodes = collected.episodes
-        if len(episodes):
-            self.experience.replay.add(episodes)
+        self.experience.replay.add(episodes)
         count = self.workers.sum(torch.tensor([len(episodes)])).item()
         self.counters.episodes += int(count)
         self.counters.env_steps += int(count) * self.spec.episode_ticks

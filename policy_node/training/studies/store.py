@@ -50,6 +50,9 @@ def add_run(folder: Path, run: Mapping[str, Any]) -> None:
     file, line = folder / RUNS, json.dumps(run, separators=(',', ':'))
     with alone_in(folder):
         stored = file.read_bytes() if file.is_file() else b''
+        if stored and not stored.endswith(b'\n'):
+            # An editor may leave the last line without its end.
+            stored += b'\n'
         write_file(file, stored + line.encode() + b'\n')
 
 

@@ -191,23 +191,28 @@ WHOLE = 16 * (51 * 13 + 3 + 50 * 4) * 4
 
 
 @pytest.mark.parametrize(
-    ('available', 'device', 'is_supported'),
-    [(WHOLE, 'cpu', False), (WHOLE - 1, 'cpu', True), (None, 'cuda', True)],
+    ('available', 'device', 'is_supported', 'others'),
+    [
+        (WHOLE, 'cpu', False, {}),
+        (WHOLE - 1, 'cpu', True, {}),
+        (None, 'cuda', True, {}),
+        (None, 'cpu', False, {'algorithm': 'ppo', 'overlap': False}),
+    ],
 )
 def test_too_little_memory_and_emulated_bfloat16_are_reported_at_the_start(
-    tmp_path, monkeypatch, capsys, available, device, is_supported
+    tmp_path, monkeypatch, capsys, available, device, is_supported, others
 ):
-    """Learning on a GPU needs no bfloat16 of the processor."""
+    """Learning on a GPU needs no bfloat16 of the processor, and PPO computes in float32."""
     supporting = is_supported and device == 'cpu'
     monkeypatch.setattr('torch.cpu._is_avx512_bf16_supported', lambda: supporting)
     monkeypatch.setattr('torch.cuda.is_bf16_supported', lambda: True)
     monkeypatch.setattr(run_module, 'choose_device', lambda _: torch.device(device))
     monkeypatch.setattr(run_module, 'available_memory', lambda: available)
     changes = {'num_envs': 2, 'total_steps': 800, 'device': 'cpu', 'precision': 'bfloat16'}
-    fields = options_of(**SMALL | changes)
+    fields = options_of(**SMALL | changes | others)
     assert main(['--task', 'FetchReach', *fields, '--output', str(tmp_path)]) == 0
     said = capsys.readouterr().err
-    assert ('use precision=float32' in said) != is_supported
+    assert ('use precision=float32' in said) == (not is_supported and not others)
     assert ('a smaller replay_transitions would fit' in said) == (available == WHOLE - 1)
 
 

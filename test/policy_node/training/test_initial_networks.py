@@ -398,7 +398,7 @@ def test_a_cycle_in_which_all_simulations_diverge_is_not_learnt_from(tmp_path, m
 
     monkeypatch.setattr(Simulation, 'step', diverge)
     trainer = trainer_of(recipe_config('FetchReach', 'robust', num_envs=2), tmp_path)
-    trainer._collect()
+    assert trainer._collect() == 0.0, 'the episodes that follow a divergence do not count'
     assert trainer._learn() is None and trainer.counters.updates == 0
 
 

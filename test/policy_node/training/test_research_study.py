@@ -307,6 +307,15 @@ def test_a_damaged_line_is_named_before_anything_is_trained(
     assert not runs.exists()
 
 
+def test_a_run_is_added_below_a_last_line_without_a_newline(tmp_path: Path) -> None:
+    """As an editor leaves it, for example after a damaged line was removed."""
+    jobs, file = jobs_of('returns', '--arms', 'one', '--seeds', '0', '1'), tmp_path / 'runs.jsonl'
+    store(tmp_path, jobs[:1])
+    file.write_text(file.read_text().rstrip('\n'))
+    store(tmp_path, jobs[1:])
+    assert [seed for *_, seed in read_runs(tmp_path)] == [0, 1]
+
+
 def test_processes_that_store_runs_at_once_lose_nothing(tmp_path: Path) -> None:
     jobs = jobs_of('returns', '--arms', 'one')
     with ThreadPoolExecutor(len(jobs)) as pool:

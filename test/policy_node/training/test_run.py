@@ -72,6 +72,12 @@ def test_a_run_without_its_replay_fills_it_up_before_it_goes_on(tmp_path, capsys
     assert '800 steps fill the replay' in said
 
 
+def test_a_run_that_kept_a_part_of_its_replay_reports_the_steps_that_fill_it(tmp_path, capsys):
+    trained(tmp_path, total_steps=800, kept_transitions=300)
+    resumed(tmp_path, total_steps=1_200).train()
+    assert capsys.readouterr().err.count('500 steps fill the replay') == 1
+
+
 @pytest.mark.release
 @pytest.mark.parametrize('damaged', [True, False])
 def test_a_replay_that_is_no_multiple_of_an_episode_is_full_with_whole_ones(tmp_path, damaged):
@@ -286,6 +292,20 @@ def test_a_full_disk_leaves_no_partial_file_and_does_not_end_a_run(tmp_path, cap
         assert 'progress.csv lacks a row: ' in said and 'the best actor is not written, ' in said
         assert not (tmp_path / 'best.safetensors').exists()
         assert counters_of(tmp_path)['best_success'] == -1
+
+
+def test_a_disk_that_is_too_full_for_the_replay_keeps_the_training_state(
+    tmp_path, monkeypatch, capsys
+):
+    """A replay of 2,000 steps needs 139 kB, a training state 35 kB."""
+    monkeypatch.setattr('policy_node.training.runs.run_folder.REPLAY_SECONDS', 0.0)
+    trainer = trainer_of(tmp_path, total_steps=2_000, checkpoint_seconds=0)
+    with files_at_most(80_000), pytest.raises(OSError, match='replay'):
+        trainer.train()
+    said = capsys.readouterr().err
+    assert 'no newer replay for --resume: ' in said and 'no checkpoint' not in said
+    assert counters_of(tmp_path)['updates'] == trainer.counters.updates == 20
+    assert checkpoint.read_info(tmp_path / 'latest.safetensors').env_steps == 2_000
 
 
 def row(steps, success):

@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from fetch_hand_sim.simulation import Simulation
+from fetch_hand_sim.simulation.rewards import GoalMetric
 from msgs_spec.tasks import task_spec
 from policy_node import load_policy
 from policy_node.policies import checkpoint
@@ -325,6 +326,20 @@ def test_an_observation_that_is_not_finite_stops_the_run(tmp_path):
     trainer.collector.collect = broken
     with pytest.raises(TrainingError, match='observation is not finite after 0'):
         trainer.train()
+
+
+def test_a_first_cycle_in_which_all_simulations_diverge_does_not_end_a_run(tmp_path, monkeypatch):
+    """Also not for a third-party task, whose first rewards are checked."""
+    monkeypatch.setattr(GoalMetric, 'has_own_reward', True)
+    trainer = trainer_of(tmp_path, total_steps=400)
+    collect, kept = trainer.collector.collect, iter([slice(0)])
+
+    def diverging(policy):
+        episodes, success = collect(policy)
+        return episodes.select(next(kept, slice(None))), success
+
+    trainer.collector.collect = diverging
+    assert trainer.train() == '400 environment steps done'
 
 
 def test_the_best_actor_is_kept_and_ties_go_to_the_better_return(tmp_path):
