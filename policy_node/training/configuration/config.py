@@ -461,7 +461,11 @@ NEEDS: tuple[tuple[str, str, Callable[[Any], bool]], ...] = (
         'algorithm ddpg',
         lambda c: c.algorithm == 'ddpg',
     ),
-    ('noise_std actor_average', 'algorithm ddpg or ppo', lambda c: c.algorithm != 'imitation'),
+    (
+        'noise_std actor_average learning_starts critic_first',
+        'algorithm ddpg or ppo',
+        lambda c: c.algorithm != 'imitation',
+    ),
     (
         'n_step longest_hold condition goal_choice ticks_after_drop parameter_noise',
         'algorithm ddpg and no subgoal_every',

@@ -157,6 +157,10 @@ def test_bad_assignments_are_refused(text, match):
         ({'condition': 'horizon', 'n_step': 3}, 'n_step 3 excludes condition horizon'),
         ({'condition': 'threshold', 'reward_type': 'dense'}, 'needs reward_type sparse'),
         ({'widest_threshold': 32.0}, 'has no effect: it needs condition threshold'),
+        (
+            {'algorithm': 'imitation', 'critic_first': 9},
+            'critic_first 9 has no effect: it needs algorithm ddpg',
+        ),
         ({'start_share': 0.3}, 'has no effect: it needs init_from and algorithm ddpg'),
         ({'importance': 'density', 'strategy': 'random'}, 'density needs goals of the episode'),
         ({'noise_seconds': 0.01}, 'noise_seconds 0.01 is less than a tick of 0.04 s'),
